@@ -1,0 +1,46 @@
+"""Spherical poses, SE(3) and pose errors: pure functions on tensors of any batch shape, no I/O."""
+
+from lp_framework.geometry.pose_errors import PoseErrors, pose_errors, rotation_error, translation_error
+from lp_framework.geometry.se3 import (
+    geodesic_angle,
+    hat,
+    inverse,
+    rigid_transform,
+    se3_exp,
+    se3_log,
+    so3_exp,
+    so3_log,
+)
+from lp_framework.geometry.spherical import (
+    apply_relative_pose,
+    camera_to_world,
+    from_ifusion,
+    relative_pose,
+    spherical_residual,
+    to_ifusion,
+    view_pose,
+    wrap_angle,
+)
+
+__all__ = [
+    "PoseErrors",
+    "apply_relative_pose",
+    "camera_to_world",
+    "from_ifusion",
+    "geodesic_angle",
+    "hat",
+    "inverse",
+    "pose_errors",
+    "relative_pose",
+    "rigid_transform",
+    "rotation_error",
+    "se3_exp",
+    "se3_log",
+    "so3_exp",
+    "so3_log",
+    "spherical_residual",
+    "to_ifusion",
+    "translation_error",
+    "view_pose",
+    "wrap_angle",
+]

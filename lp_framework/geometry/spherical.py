@@ -1,0 +1,122 @@
+"""Spherical view poses, relative poses, and the cameras that they stand for.
+
+Convention (the paper's appendix, Coordinate System): a view pose `[..., 3]` is (latitude, longitude, radius) in
+radians, radians, scene units. Latitude is up-positive from the equator; longitude 0 lies on +Z and grows towards +X
+(counter-clockwise seen from +Y); the camera looks at the origin, +Y is up. `camera_to_world` `[..., 4, 4]` is OpenGL
+style: the camera looks down its -Z, +Y up, +X right. Batch dimensions are any.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from lp_framework.geometry.se3 import geodesic_angle, rigid_transform
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """The same angle in [-pi, pi), radians; exact (and so sign-preserving) for angles already there.
+
+    >>> wrap_angle(torch.tensor([3.5, -3.5, 0.25, torch.pi]))
+    tensor([-2.7832,  2.7832,  0.2500, -3.1416])
+    """
+    rest = torch.fmod(angle[..., None], 2 * math.pi)  # exact, in (-2 pi, 2 pi), and so are the two shifts
+    rest = torch.where(rest >= math.pi, rest - 2 * math.pi, rest)
+    return torch.where(rest < -math.pi, rest + 2 * math.pi, rest).squeeze(-1)
+
+
+def _reduce(angle: Tensor, turn: float) -> Tensor:
+    """The same angle in [0, turn); `angle` needs a dimension (see `se3._even_function`)."""
+    rest = torch.remainder(angle, turn)
+    # For a tiny negative angle `remainder` rounds to `turn` itself.
+    return torch.where(rest >= turn, rest - turn, rest)
+
+
+def relative_pose(reference: Tensor, query: Tensor) -> Tensor:
+    """Relative pose `[..., 3]`, query minus reference, of two view poses `[..., 3]`; longitude in [0, 2 pi).
+
+    >>> relative_pose(torch.tensor([0.1, 6.2, 1.5]), torch.tensor([0.3, 0.1, 1.5]))
+    tensor([0.2000, 0.1832, 0.0000])
+    """
+    latitude, longitude, radius = (query - reference).split(1, dim=-1)
+    return torch.cat([latitude, _reduce(longitude, 2 * math.pi), radius], dim=-1)
+
+
+def apply_relative_pose(reference: Tensor, x: Tensor) -> Tensor:
+    """View pose `[..., 3]` of the query: reference plus relative pose `x`, both `[..., 3]`; longitude in [0, 2 pi).
+
+    >>> apply_relative_pose(torch.tensor([0.1, 6.2, 1.5]), torch.tensor([0.2, 0.1832, 0.0]))
+    tensor([0.3000, 0.1000, 1.5000])
+    """
+    latitude, longitude, radius = (reference + x).split(1, dim=-1)
+    return torch.cat([latitude, _reduce(longitude, 2 * math.pi), radius], dim=-1)
+
+
+def camera_to_world(pose: Tensor) -> Tensor:
+    """Camera matrix `[..., 4, 4]` of a view pose `[..., 3]`: rotation Ry(longitude) Rx(-latitude), smooth everywhere.
+
+    >>> camera_to_world(torch.tensor([0.0, torch.pi / 6, 2.0]))
+    tensor([[ 0.8660, -0.0000,  0.5000,  1.0000],
+            [ 0.0000,  1.0000,  0.0000,  0.0000],
+            [-0.5000, -0.0000,  0.8660,  1.7321],
+            [ 0.0000,  0.0000,  0.0000,  1.0000]])
+    """
+    latitude, longitude, radius = pose.unbind(-1)
+    sin_lat, cos_lat, sin_lon, cos_lon = latitude.sin(), latitude.cos(), longitude.sin(), longitude.cos()
+    right = torch.stack([cos_lon, torch.zeros_like(cos_lon), -sin_lon], dim=-1)
+    up = torch.stack([-sin_lat * sin_lon, cos_lat, -sin_lat * cos_lon], dim=-1)
+    backward = torch.stack([cos_lat * sin_lon, sin_lat, cos_lat * cos_lon], dim=-1)
+    return rigid_transform(torch.stack([right, up, backward], dim=-1), radius[..., None] * backward)
+
+
+def view_pose(camera: Tensor) -> Tensor:
+    """View pose `[..., 3]` of the centre of a camera `[..., 4, 4]`; latitude in [-pi/2, pi/2], longitude in [0, 2 pi).
+
+    At the poles, to rounding, the centre does not tell the longitude; it is then that of the camera's right axis, which
+    keeps `view_pose(camera_to_world(pose)) == pose` there. Latitude and longitude have no derivative at the poles.
+
+    >>> view_pose(camera_to_world(torch.tensor([-0.3, 6.0, 1.5])))
+    tensor([-0.3000,  6.0000,  1.5000])
+    """
+    x, y, z = camera[..., :3, 3].split(1, dim=-1)
+    radius = torch.linalg.vector_norm(camera[..., :3, 3], dim=-1, keepdim=True)
+    horizontal_squared = x.square() + z.square()
+    polar = horizontal_squared <= (4 * torch.finfo(x.dtype).eps * radius).square()
+    horizontal = horizontal_squared.masked_fill(polar, 1.0).sqrt().masked_fill(polar, 0.0)
+    longitude = torch.atan2(torch.where(polar, -camera[..., 2, :1], x), torch.where(polar, camera[..., 0, :1], z))
+    return torch.cat([torch.atan2(y, horizontal), _reduce(longitude, 2 * math.pi), radius], dim=-1)
+
+
+def spherical_residual(camera: Tensor) -> Tensor:
+    """How far a camera `[..., 4, 4]` is from spherical: angle `[...]` in degrees to the spherical one at its centre.
+
+    The rotation error, against this camera, of a method that finds its centre exactly but predicts spherical cameras.
+
+    >>> upright = rigid_transform(torch.eye(3), torch.tensor([1.0, 0.0, 1.0]))  # looks along -Z, past the origin
+    >>> spherical_residual(upright)
+    tensor(45.)
+    """
+    spherical = camera_to_world(view_pose(camera))
+    return torch.rad2deg(geodesic_angle(camera[..., :3, :3], spherical[..., :3, :3]))
+
+
+def from_ifusion(latlon_degrees: Tensor) -> Tensor:
+    """View pose `[..., 3]` of an iFusion `latlon` `[..., 3]`: (down-positive latitude, longitude, in degrees; radius).
+
+    >>> from_ifusion(torch.tensor([-30.0, 90.0, 1.5]))
+    tensor([0.5236, 1.5708, 1.5000])
+    """
+    down, longitude, radius = latlon_degrees.split(1, dim=-1)
+    return torch.cat([-torch.deg2rad(down), _reduce(torch.deg2rad(longitude), 2 * math.pi), radius], dim=-1)
+
+
+def to_ifusion(pose: Tensor) -> Tensor:
+    """The iFusion `latlon` `[..., 3]` of a view pose: (down-positive latitude, longitude in [0, 360), degrees; radius).
+
+    >>> to_ifusion(torch.tensor([0.5235988, 1.5707963, 1.5]))
+    tensor([-30.0000,  90.0000,   1.5000])
+    """
+    latitude, longitude, radius = pose.split(1, dim=-1)
+    return torch.cat([-torch.rad2deg(latitude), _reduce(torch.rad2deg(longitude), 360.0), radius], dim=-1)
