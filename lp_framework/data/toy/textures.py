@@ -1,0 +1,273 @@
+"""Painted textures: a palette, grained and patterned grounds, lettering, and the sheets that boxes and slabs wear."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+Colour = tuple[int, int, int]
+
+CREAM: Colour = (242, 226, 190)
+RED: Colour = (200, 58, 44)
+MAROON: Colour = (122, 36, 40)
+ORANGE: Colour = (232, 124, 44)
+MUSTARD: Colour = (234, 178, 54)
+LEAF: Colour = (104, 156, 72)
+FOREST: Colour = (52, 100, 66)
+TEAL: Colour = (42, 134, 140)
+SKY: Colour = (136, 192, 218)
+BLUE: Colour = (52, 104, 168)
+NAVY: Colour = (34, 56, 92)
+PINK: Colour = (232, 150, 142)
+WOOD: Colour = (178, 120, 68)
+BROWN: Colour = (112, 70, 44)
+STEEL: Colour = (164, 172, 180)
+SLATE: Colour = (86, 94, 106)
+DARK: Colour = (46, 44, 48)
+WHITE: Colour = (250, 246, 236)
+GLASS: Colour = (64, 92, 112)
+
+
+def plain(colour: Colour) -> Image.Image:
+    """A texture of one colour."""
+    return Image.new("RGB", (8, 8), colour)
+
+
+def shade(colour: Colour, factor: float) -> Colour:
+    """The colour made darker (`factor` < 1) or, towards white, lighter (`factor` > 1)."""
+    goal = 0 if factor < 1 else 255
+    weight = abs(factor - 1)
+    r, g, b = (round(c + (goal - c) * weight) for c in colour)
+    return r, g, b
+
+
+def pen(image: Image.Image) -> ImageDraw.ImageDraw:
+    """A pen to draw on the image."""
+    return ImageDraw.Draw(image)
+
+
+def noise(width: int, height: int, columns: int, rows: int, seed: int) -> NDArray[np.float64]:
+    """Smooth noise `[height, width]` in about [-1, 1] from a grid of random values; its left and right edges meet."""
+    grid = np.random.default_rng(seed).uniform(-1, 1, (rows, columns)).astype(np.float32)
+    wrapped = np.concatenate([grid[:, -2:], grid, grid[:, :2]], axis=1)
+    cell = width / columns
+    area = (2 * cell, 0, 2 * cell + width, rows)
+    stretched = Image.fromarray(wrapped).resize((round(cell * (columns + 4)), rows), Image.Resampling.BICUBIC)
+    return np.asarray(stretched.resize((width, height), Image.Resampling.BICUBIC, box=area), dtype=np.float64)
+
+
+def mottle(image: Image.Image, strength: float = 0.08, seed: int = 0, cells: int = 12) -> Image.Image:
+    """The image with its brightness gently uneven, as paint and clay are."""
+    width, height = image.size
+    rows = max(2, round(cells * height / width))
+    coarse = noise(width, height, cells, rows, seed)
+    fine = noise(width, height, 5 * cells, 5 * rows, seed + 1)
+    gain = 1 + strength * (0.65 * coarse + 0.35 * fine)
+    return Image.fromarray((np.asarray(image, dtype=np.float64) * gain[..., None]).clip(0, 255).astype(np.uint8))
+
+
+def painted(colour: Colour, seed: int = 0, strength: float = 0.06, size: int = 256) -> Image.Image:
+    """A softly uneven ground of one colour."""
+    return mottle(Image.new("RGB", (size, size), colour), strength, seed, cells=6)
+
+
+def wood(colour: Colour, width: int = 512, height: int = 512, seed: int = 0) -> Image.Image:
+    """Wood with its grain along the width."""
+    warp = noise(width, height, 3, 6, seed)
+    rows = np.arange(height)[:, None] / height
+    rings = np.sin(2 * np.pi * (9 * rows + 1.3 * warp))
+    fibres = noise(width, height, 12, height // 3, seed + 1)
+    gain = 1 + 0.10 * rings + 0.10 * fibres
+    return Image.fromarray((np.array(colour) * gain[..., None]).clip(0, 255).astype(np.uint8))
+
+
+def planks(colour: Colour, width: int = 512, height: int = 512, rows: int = 6, seed: int = 0) -> Image.Image:
+    """Boards lying one above the other, each of its own tone, with dark joints and nail heads."""
+    image = wood(colour, width, height, seed)
+    tones = 1 + np.random.default_rng(seed).uniform(-0.14, 0.10, rows)
+    row = np.minimum(np.arange(height) * rows // height, rows - 1)
+    image = Image.fromarray((np.asarray(image) * tones[row][:, None, None]).clip(0, 255).astype(np.uint8))
+    draw = pen(image)
+    for k in range(rows):
+        y = k * height // rows
+        draw.line([(0, y), (width, y)], fill=shade(colour, 0.45), width=max(2, height // 128))
+        for x in (width // 24, width - width // 24):
+            dot(draw, x, y + height // rows // 2, height / 128, shade(colour, 0.4))
+    return image
+
+
+def bricks(
+    colour: Colour, mortar: Colour, width: int = 512, height: int = 512, rows: int = 12, seed: int = 0
+) -> Image.Image:
+    """A wall in running bond, every brick of its own tone."""
+    image = Image.new("RGB", (width, height), mortar)
+    draw = pen(image)
+    random = np.random.default_rng(seed)
+    high = height / rows
+    columns = max(2, round(width / (2.2 * high)))
+    long = width / columns
+    for row in range(rows):
+        for column in range(-1, columns + 1):
+            x, y = (column + 0.5 * (row % 2)) * long, row * high
+            fill = shade(colour, 1 + random.uniform(-0.22, 0.14))
+            draw.rounded_rectangle([x + 2, y + 2, x + long - 2, y + high - 2], radius=3, fill=fill)
+    return mottle(image, 0.08, seed)
+
+
+def shingles(colour: Colour, width: int = 512, height: int = 512, rows: int = 10, seed: int = 0) -> Image.Image:
+    """Round roof tiles, overlapping downwards."""
+    image = Image.new("RGB", (width, height), shade(colour, 0.55))
+    draw = pen(image)
+    random = np.random.default_rng(seed)
+    high = height / rows
+    columns = max(2, round(width / (1.1 * high)))
+    long = width / columns
+    for row in range(rows, -2, -1):
+        for column in range(-1, columns + 1):
+            x, y = (column + 0.5 * (row % 2)) * long, row * high
+            fill = shade(colour, 1 + random.uniform(-0.18, 0.14))
+            edge = shade(colour, 0.5)
+            area = [x + 1, y - high, x + long - 1, y + 1.25 * high]
+            draw.rounded_rectangle(area, radius=0.48 * long, fill=fill, outline=edge, width=3)
+    return image
+
+
+def dot(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: Colour) -> None:
+    """A filled disc."""
+    draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=colour)
+
+
+def rivets(image: Image.Image, margin: float, step: float, radius: float, colour: Colour) -> None:
+    """Rivet heads along the four edges of the image."""
+    width, height = image.size
+    draw = pen(image)
+    across = np.linspace(margin, width - margin, max(2, round(width / step)))
+    down = np.linspace(margin, height - margin, max(2, round(height / step)))
+    for x, y in [(x, y) for x in across for y in (margin, height - margin)] + [
+        (x, y) for y in down for x in (margin, width - margin)
+    ]:
+        dot(draw, x + radius / 3, y + radius / 3, radius, shade(colour, 0.45))
+        dot(draw, x, y, radius, colour)
+
+
+def text(
+    image: Image.Image, words: str, x: float, y: float, size: float, colour: Colour, outline: Colour | None = None
+) -> None:
+    """Bold lettering centred at `(x, y)`, `size` pixels high."""
+    stroke = max(1, round(size / 22))
+    font = ImageFont.load_default(size)
+    draw = pen(image)
+    if outline is not None:
+        draw.text((x, y), words, outline, font, anchor="mm", stroke_width=3 * stroke, stroke_fill=outline)
+    draw.text((x, y), words, colour, font, anchor="mm", stroke_width=stroke, stroke_fill=colour)
+
+
+def star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: Colour, points: int = 5) -> None:
+    """A star with one tip up."""
+    angle = np.arange(2 * points) * np.pi / points
+    reach = np.where(np.arange(2 * points) % 2 == 0, radius, 0.42 * radius)
+    draw.polygon([(x + r * np.sin(a), y - r * np.cos(a)) for a, r in zip(angle, reach, strict=True)], fill=colour)
+
+
+def flower(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, petal: Colour, heart: Colour) -> None:
+    """A flower of seven petals."""
+    for angle in np.arange(7) * 2 * np.pi / 7:
+        dot(draw, x + 0.62 * radius * np.sin(angle), y - 0.62 * radius * np.cos(angle), 0.42 * radius, petal)
+    dot(draw, x, y, 0.36 * radius, heart)
+
+
+def window(
+    draw: ImageDraw.ImageDraw, left: float, top: float, right: float, bottom: float, frame: Colour, bars: int = 1
+) -> None:
+    """A framed window with sky in its panes, `bars` upright and one across."""
+    rim = max(4.0, 0.07 * (right - left))
+    draw.rounded_rectangle([left, top, right, bottom], radius=rim, fill=frame)
+    inner = (left + rim, top + rim, right - rim, bottom - rim)
+    draw.rectangle(inner, fill=GLASS)
+    wide, high = inner[2] - inner[0], inner[3] - inner[1]
+    draw.polygon(
+        [
+            (inner[0] + 0.15 * wide, inner[3]),
+            (inner[0] + 0.6 * wide, inner[1]),
+            (inner[0] + 0.85 * wide, inner[1]),
+            (inner[0] + 0.4 * wide, inner[3]),
+        ],
+        fill=shade(GLASS, 1.25),
+    )
+    for k in range(1, bars + 1):
+        x = inner[0] + wide * k / (bars + 1)
+        draw.rectangle([x - rim / 3, inner[1], x + rim / 3, inner[3]], fill=frame)
+    if bars:
+        draw.rectangle([inner[0], inner[1] + high / 2 - rim / 3, inner[2], inner[1] + high / 2 + rim / 3], fill=frame)
+
+
+def bands(stops: list[tuple[float, Colour]], size: int = 512) -> Image.Image:
+    """Level bands, bottom to top: each colour reaches up to its fraction of the height."""
+    image = Image.new("RGB", (8, size))
+    draw = pen(image)
+    start = 0.0
+    for stop, colour in stops:
+        draw.rectangle([0, round(size * (1 - stop)), 8, round(size * (1 - start))], fill=colour)
+        start = stop
+    return image
+
+
+def box_sheet(
+    front: Image.Image,
+    right: Image.Image,
+    back: Image.Image,
+    left: Image.Image,
+    top: Image.Image,
+    bottom: Image.Image,
+    cell: int = 448,
+) -> Image.Image:
+    """The texture of `shapes.box`: six pictures, each as seen from outside (the top from above, the front below)."""
+    sheet = Image.new("RGB", (3 * cell, 2 * cell))
+    for index, picture in enumerate((front, right, back, left, top, bottom)):
+        place = (index % 3 * cell, index // 3 * cell)
+        sheet.paste(picture.resize((cell, cell), Image.Resampling.LANCZOS), place)
+    return sheet
+
+
+def all_sides(picture: Image.Image) -> Image.Image:
+    """The texture of `shapes.box` with one picture on its six faces."""
+    return box_sheet(picture, picture, picture, picture, picture, picture, cell=256)
+
+
+def slab_sheet(front: Image.Image, back: Image.Image, rim: Image.Image, size: int = 1024) -> Image.Image:
+    """The texture of `shapes.extrude`: front, back as seen from behind, and a strip along the rim."""
+    sheet = Image.new("RGB", (size, size))
+    high = size * 3 // 4
+    for column, picture in enumerate((front, back)):
+        sheet.paste(picture.resize((size // 2, high), Image.Resampling.LANCZOS), (column * size // 2, 0))
+    sheet.paste(rim.resize((size, size - high), Image.Resampling.LANCZOS), (0, high))
+    return sheet
+
+
+def band(picture: Image.Image, start: float, stop: float, ground: Colour, size: int = 1024) -> Image.Image:
+    """A square texture that shows the picture between the heights `start` and `stop` (fractions from the bottom)."""
+    image = Image.new("RGB", (size, size), ground)
+    top, bottom = round(size * (1 - stop)), round(size * (1 - start))
+    image.paste(picture.resize((size, bottom - top), Image.Resampling.LANCZOS), (0, top))
+    return image
+
+
+def wheel_paint(hub: Colour, tyre: Colour = DARK) -> Image.Image:
+    """Hub cap, rim and tyre, as level bands over a wheel seen from its side."""
+    cap, rim = shade(hub, 1.5), shade(hub, 0.6)
+    near = [(0.06, cap), (0.08, rim), (0.19, hub), (0.215, rim)]
+    far = [(0.81, rim), (0.92, hub), (0.94, rim), (1.0, cap)]
+    return bands([*near, (0.785, tyre), *far])
+
+
+def wrapped(front: Image.Image, right: Image.Image, back: Image.Image, left: Image.Image) -> Image.Image:
+    """Four pictures of one height side by side, as they go around a loft of `shapes.plan` rings."""
+    half = back.width // 2
+    ends = back.crop((half, 0, back.width, back.height)), back.crop((0, 0, half, back.height))
+    sheet = Image.new("RGB", (front.width + right.width + back.width + left.width, front.height))
+    x = 0
+    for picture in (ends[0], left, front, right, ends[1]):
+        sheet.paste(picture, (x, 0))
+        x += picture.width
+    return sheet
