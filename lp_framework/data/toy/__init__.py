@@ -35,7 +35,7 @@ def toy_objects() -> list[MeshObject]:
         MeshObject("tram", "twofold", tram),
         MeshObject("juice_carton", "twofold", juice_carton),
         MeshObject("suitcase", "twofold", suitcase),
-        MeshObject("soup_can", "continuous", soup_can),  # its label tells the longitude
+        MeshObject("soup_can", "continuous", soup_can, unique_answer=True),  # its label tells the longitude
         MeshObject("lotus_vase", "continuous", lotus_vase),  # its pattern repeats 16 times
         MeshObject("celadon_bottle", "continuous", celadon_bottle),  # plain
     ]

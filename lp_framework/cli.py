@@ -1,0 +1,90 @@
+"""The command line: `python -m lp_framework COMMAND [overrides]`, also installed as `lp`.
+
+Nothing heavy is imported before a command is known, so that the overview comes at once.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+
+from lp_framework import torchvision_ops
+from lp_framework.errors import UserError, nearest
+
+COMMANDS = {  # the module of a command is lp_framework.commands.NAME
+    "train": "Train a score or energy model of the relative pose",
+    "eval": "Estimate the poses of a data set's test views and report recall, success rate and errors",
+    "render": "Render meshes to views on disk",
+    "bench": "Measure how many pairs a second the data loaders deliver, and their memory",
+    "plugins": "List every model, prior, solver, ... with its origin and its settings",
+}
+
+EXAMPLES = {
+    "lp train": "train on the embedded objects",
+    "lp train model=energy trainer.max_epochs=5": "choose another model, change a setting",
+    "lp eval --multirun solver.gamma=0,0.3 start=ring,grid": "every combination, a folder each",
+    "lp train --help": "the settings of a command, and what can be chosen",
+    "lp train --cfg job": "the configuration, without running",
+    "lp plugins": "what can be chosen, in full",
+}
+
+
+def main() -> int:
+    """Run the command of `sys.argv`; the exit status: 0, 1 for bad input, 2 for a command line that makes no sense."""
+    torchvision_ops.install()
+    command, *arguments = sys.argv[1:] or ["--help"]
+    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"  # the user asks for tracebacks
+    try:
+        if command in ("--help", "-h"):
+            _print_overview()
+        elif command == "--version":
+            print(f"lp_framework {_version()}")
+        elif command not in COMMANDS:
+            print(f"error: there is no command '{command}'{nearest(command, COMMANDS)}", end=" ", file=sys.stderr)
+            print(f"(known: {', '.join(COMMANDS)})", file=sys.stderr)
+            return 2
+        elif command == "plugins":
+            from lp_framework.commands import plugins
+
+            plugins.main(arguments)
+        else:
+            from lp_framework import hydra_app
+
+            hydra_app.run(command, arguments)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of a pipe, such as head, has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except UserError as error:
+        if full_error:
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 1 if type(error) is UserError else 2
+    return 0
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("lp_framework")
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _print_overview() -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 10_000)
+    console.print("[bold]lp_framework[/]: the camera viewpoint between photographs of one object\n")
+    console.print("Usage: [bold]python -m lp_framework COMMAND[/] \\[key=value ...], or [bold]lp COMMAND[/] ...\n")
+    for title, rows in (("Commands", COMMANDS), ("Examples", EXAMPLES)):
+        table = Table(box=None, show_header=False, padding=(0, 2))
+        for left, right in rows.items():
+            table.add_row(f"[cyan]{left}[/]", right)
+        console.print(f"[bold]{title}[/]")
+        console.print(table)
+        console.print()
+    console.print("HYDRA_FULL_ERROR=1 shows the traceback of an error.")

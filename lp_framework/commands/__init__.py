@@ -1,0 +1,1 @@
+"""The commands, a module each: `run(config)` gets the composed configuration."""

@@ -1,0 +1,55 @@
+"""From a composed config to objects, and what every run records of itself."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from lp_framework import registry
+from lp_framework.data.module import PairDataModule
+
+
+def build_data(config: DictConfig) -> PairDataModule:
+    """The data module of a config, with its renderer."""
+    renderer = None
+    if "renderer" in registry.component_names(registry.get("data", config.data.name)):
+        renderer = registry.build("renderer", config.renderer)
+    data: PairDataModule = registry.build("data", config.data, renderer=renderer)
+    return data
+
+
+def run_folder() -> Path:
+    """The folder of this run, made if need be."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A config as dicts, lists, names and numbers."""
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    return {str(key): value for key, value in values.items()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes, and the state of the source tree where there is one."""
+    packages = ("lp_framework", "torch", "torchvision", "lightning", "numpy", "trimesh", "pyrender")
+    found = {name: importlib.metadata.version(name) for name in packages}
+    return {"python": platform.python_version(), **found, "git": _git_state()}
+
+
+def _git_state() -> str:
+    here = Path(__file__).parents[2]
+    if not (here / ".git").exists():
+        return "not a checkout"
+    try:
+        command = ["git", "-C", str(here), "describe", "--always", "--dirty"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

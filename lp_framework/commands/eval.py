@@ -1,0 +1,66 @@
+"""`eval`: a solver on a data set's test views, as a table in the paper's layout, JSON and CSV."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+from lightning import Trainer, seed_everything
+from lightning.pytorch.callbacks import Callback, RichProgressBar
+from omegaconf import DictConfig
+from rich.console import Console
+
+from lp_framework import registry
+from lp_framework.commands.building import build_data, plain, run_folder, versions
+from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
+from lp_framework.models.checkpoints import find_checkpoint, load_model, newest_checkpoint
+from lp_framework.viz.pictures import save_pictures
+
+
+def run(config: DictConfig) -> None:
+    """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder."""
+    folder = run_folder()
+    seed_everything(config.seed, verbose=False)
+    components: dict[str, Any] = {}
+    checkpoint: Path | None = None
+    if "model" in registry.component_names(registry.get("solver", config.solver.name)):
+        checkpoint = newest_checkpoint() if config.checkpoint is None else find_checkpoint(config.checkpoint)
+        components["model"] = load_model(checkpoint)
+    solver = registry.build("solver", config.solver, **components)
+    starts = registry.build("start", config.start)
+    data = build_data(config)
+    bars: list[Callback] = [RichProgressBar(leave=False)]
+    trainer = Trainer(
+        **plain(config.trainer), default_root_dir=folder, logger=False, callbacks=bars, use_distributed_sampler=False
+    )
+    data.trainer = trainer
+    if trainer.is_global_zero:
+        data.prepare_data()
+    trainer.strategy.barrier("data")
+    split = "train" if config.protocol == "ifusion" else "test"
+    evaluation = Evaluation(solver, starts, data.table(split), config.seed)
+    loader = data.evaluation_dataloader(config.protocol, config.seed)
+    with warnings.catch_warnings():
+        # Batches come from memory, in this process.
+        warnings.filterwarnings("ignore", ".*does not have many workers.*")
+        trainer.test(evaluation, loader, verbose=False)
+    result = {
+        **evaluation.result(),
+        "protocol": config.protocol,
+        "seed": config.seed,
+        "checkpoint": str(checkpoint) if checkpoint else None,
+        "config": plain(config),
+        "versions": versions(),
+    }
+    if not trainer.is_global_zero:
+        return
+    write_result(folder, result, evaluation.metrics, evaluation.table)
+    pictures = save_pictures(folder / "pictures", evaluation, data.data(split))
+    console = Console(width=150 if not Console().is_terminal else None, highlight=False)
+    title = f"{config.data.name}, {config.solver.name}, start={config.start.name}, {result['pairs']} pairs ({config.protocol})"
+    console.print(terminal_table(title, summary_rows(result)))
+    console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
+    console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)
+    console.print(f"pictures: {', '.join(str(picture) for picture in pictures)}", soft_wrap=True)

@@ -1,0 +1,266 @@
+"""Meshes: loading any file that trimesh reads, normalising it, and the surfaces that the renderers draw.
+
+A scene is normalised when the centre of its bounding box is the origin and the longest side of the box is 1 (the
+paper, Dataset Construction). What both renderers need of a scene, down to the normals, is worked out here, once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.sparse import coo_array
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from lp_framework.errors import UserError
+
+Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
+
+NEUTRAL_GREY = 0.6  # linear reflectance of what has neither texture nor colour
+CREASE_ANGLE = np.radians(40)  # edges that bend less are shaded smooth
+LARGEST_TEXTURE = 2048  # pixels a side; finer detail than the views can show
+
+
+@dataclass(frozen=True)
+class MeshObject:
+    """One object of a data source.
+
+    `load` returns its normalised scene; it must be a module-level function or a `functools.partial` of one, so that
+    worker processes can receive it. `ambiguity` is the object's ambiguity class. `unique_answer` says whether a view
+    has one right longitude: shapes without symmetry and two-fold ones, whose texture tells, have (the default), bodies
+    of revolution only with a texture that tells; None where nobody has looked.
+    """
+
+    name: str
+    ambiguity: Ambiguity
+    load: Callable[[], trimesh.Scene]
+    unique_answer: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.unique_answer is None and self.ambiguity != "unlabelled":
+            object.__setattr__(self, "unique_answer", self.ambiguity in ("unique", "twofold"))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """T triangles of one material in the scene's frame; corner `3 i + j` is the j-th of triangle i, none is shared.
+
+    Colours multiply: the texture (sRGB, decoded by the renderers), `colour` and `corner_colours` (both linear).
+    """
+
+    positions: NDArray[np.float32]  # [3T, 3]
+    normals: NDArray[np.float32]  # [3T, 3], unit, on the side from which the corners run counter-clockwise
+    twins: NDArray[np.int64]  # [T], index among the triangles of all surfaces of the one that backs this one, or -1
+    colour: NDArray[np.float32]  # [3]
+    corner_colours: NDArray[np.float32] | None  # [3T, 3]
+    texture: NDArray[np.uint8] | None  # [h, w, 3], powers of two, first row on top
+    texture_coordinates: NDArray[np.float32] | None  # [3T, 2], v upwards
+
+
+# ---------------------------------------------------------------- loading
+
+
+def load_scene(path: str | Path) -> trimesh.Scene:
+    """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...).
+
+    Warns once a file when part of it has neither texture nor colour; that part is drawn in a neutral grey.
+    Raises `UserError` naming the file when it is missing, does not load, has no faces or has no extent.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such mesh file")
+    try:
+        loaded = trimesh.load_scene(str(path))
+    except Exception as error:  # the parsers of trimesh raise anything from KeyError to struct.error
+        raise UserError(f"{path}: does not load as a mesh ({type(error).__name__}: {error})") from error
+    try:
+        scene = normalise(loaded)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    plain = sum(not _has_colour(mesh) for mesh in scene.geometry.values())
+    if plain:
+        warnings.warn(
+            f"{path}: {plain} of {len(scene.geometry)} meshes have no texture or colour; they are drawn in light grey",
+            stacklevel=2,
+        )
+    return scene
+
+
+def normalise(scene: trimesh.Scene) -> trimesh.Scene:
+    """A copy with the bounding box centred at the origin and its longest side 1, all transforms applied.
+
+    What is not a mesh with faces (points, paths) is left out. Raises `UserError` when no faces, no extent or no
+    area remain.
+    """
+    meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    if not meshes:
+        raise UserError("the mesh has no faces")
+    bounds = np.array([mesh.bounds for mesh in meshes])
+    lowest, highest = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    side = (highest - lowest).max()
+    if not (np.isfinite(side) and side > 0):
+        raise UserError(f"the mesh has no proper extent (the longest side of its bounding box is {side})")
+    if not any(mesh.area > 0 for mesh in meshes):
+        raise UserError("all faces of the mesh have area 0")
+    for mesh in meshes:
+        mesh.vertices = (mesh.vertices - (lowest + highest) / 2) / side
+    return trimesh.Scene(meshes)
+
+
+def fingerprint(scene: trimesh.Scene) -> str:
+    """A hash of everything of a scene that its rendering depends on."""
+    digest = hashlib.sha256()
+    for surface in surfaces(scene):
+        for array in vars(surface).values():
+            if array is not None:
+                digest.update(str(array.shape).encode())
+                digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:16]
+
+
+# ---------------------------------------------------------------- surfaces
+
+
+def surfaces(scene: trimesh.Scene) -> list[Surface]:
+    """What a scene looks like, one `Surface` a mesh.
+
+    Normals follow from the shape alone: smooth across edges that bend less than `CREASE_ANGLE`, seams of the texture
+    included, whatever normals the file has. Metalness, normal maps and transparency are left out. Of triangles that
+    coincide, and look the same way, the first is kept: which of them won would be chance.
+    """
+    meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    mesh_of_triangle = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+    face_of_triangle = np.concatenate([np.arange(len(mesh.faces)) for mesh in meshes])
+    points = _weld(np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)).reshape(-1, 3)
+    degenerate = (points == np.roll(points, 1, axis=1)).any(axis=1)
+    points = _lowest_first(points)
+    kept = np.sort(np.unique(points, axis=0, return_index=True)[1])
+    kept = kept[~degenerate[kept]]
+    twins = _twins(points[kept])
+    parts = ((mesh, mesh_of_triangle[kept] == index) for index, mesh in enumerate(meshes))
+    return [_surface(mesh, face_of_triangle[kept[own]], twins[own]) for mesh, own in parts if own.any()]
+
+
+def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.int64]) -> Surface:
+    corners = mesh.faces[faces].reshape(-1)
+    image = _image(mesh)
+    return Surface(
+        positions=mesh.vertices[corners].astype(np.float32),
+        normals=_corner_normals(mesh.triangles[faces]),
+        twins=twins,
+        colour=_material_colour(mesh),
+        corner_colours=_corner_colours(mesh, faces),
+        texture=None if image is None else _texture(image),
+        texture_coordinates=None if image is None else np.asarray(mesh.visual.uv, np.float32)[corners],  # type: ignore
+    )
+
+
+def _weld(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Indices `[n]` that are equal for the points `[n, 3]` that coincide."""
+    scale = 1e-6 * max(float(np.ptp(points, axis=0).max()), np.finfo(float).tiny)
+    return np.unique(np.round(points / scale).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _lowest_first(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles `[T, 3]` of point indices, each begun at its lowest index and otherwise in the same order."""
+    return triangles[np.arange(len(triangles))[:, None], (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3]
+
+
+def _twins(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each of the distinct triangles `[T, 3]` the index of the one with the same points in the other order, or -1.
+
+    Modellers that paint the two sides of a sheet differently write it as such a pair.
+    """
+    turned = triangles[:, [0, 2, 1]]
+    group = np.unique(np.concatenate([triangles, turned]), axis=0, return_inverse=True)[1].reshape(-1)
+    owner = np.full(group.max() + 1, -1)
+    owner[group[: len(triangles)]] = np.arange(len(triangles))
+    return owner[group[len(triangles) :]]
+
+
+def _corner_normals(triangles: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit normals `[3T, 3]` of the corners of `[T, 3, 3]`: the area-weighted mean over the faces around the corner's
+    point whose own normals lie within the crease angle of the corner's face."""
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])  # normals times 2 area
+    units = trimesh.util.unitize(areas)
+    points = _weld(triangles.reshape(-1, 3))
+    face_of_corner = np.repeat(np.arange(len(triangles)), 3)
+    incidence = coo_array((np.ones(len(points), np.int8), (np.arange(len(points)), points))).tocsr()
+    corner, other = (incidence @ incidence.T).nonzero()  # all pairs of corners that share a point
+    near = (units[face_of_corner[corner]] * units[face_of_corner[other]]).sum(axis=1) > np.cos(CREASE_ANGLE)
+    corner, weighted = corner[near], areas[face_of_corner[other[near]]]
+    normals = np.stack([np.bincount(corner, weighted[:, axis], len(points)) for axis in range(3)], axis=1)
+    return trimesh.util.unitize(normals).astype(np.float32)
+
+
+# ---------------------------------------------------------------- colours
+
+
+def _has_colour(mesh: trimesh.Trimesh) -> bool:
+    coloured = isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind is not None
+    return coloured or _image(mesh) is not None or _factor(mesh) is not None
+
+
+def _image(mesh: trimesh.Trimesh) -> Image.Image | None:
+    """The image that colours the mesh, where it has texture coordinates as well."""
+    if not isinstance(mesh.visual, TextureVisuals) or mesh.visual.uv is None:
+        return None
+    match mesh.visual.material:
+        case PBRMaterial(baseColorTexture=image) | SimpleMaterial(image=image):
+            return image
+    return None
+
+
+def _factor(mesh: trimesh.Trimesh) -> NDArray[np.floating] | None:
+    """The one linear colour `[3]` that the material gives, where the file has one."""
+    match mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None:
+        case PBRMaterial(baseColorFactor=factor) if factor is not None:
+            return np.asarray(factor, float)[:3] / 255  # glTF: linear
+        case SimpleMaterial(image=None, diffuse=diffuse, kwargs=properties) if "kd" in properties or not np.array_equal(
+            diffuse, SimpleMaterial().diffuse
+        ):
+            return srgb_to_linear(np.asarray(diffuse, float)[:3] / 255)
+    return None
+
+
+def _material_colour(mesh: trimesh.Trimesh) -> NDArray[np.float32]:
+    factor = _factor(mesh)
+    if factor is None:
+        factor = np.full(3, 1.0 if _has_colour(mesh) else NEUTRAL_GREY)
+    return factor.astype(np.float32)
+
+
+def _corner_colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[np.float32] | None:
+    """Linear colours `[3T, 3]` from vertex or face colours, which files store in sRGB."""
+    if not isinstance(mesh.visual, ColorVisuals) or mesh.visual.kind is None:
+        return None
+    if mesh.visual.kind == "vertex":
+        colours = mesh.visual.vertex_colors[mesh.faces[faces].reshape(-1)]
+    else:
+        colours = np.repeat(mesh.visual.face_colors[faces], 3, axis=0)
+    return srgb_to_linear(colours[:, :3] / 255).astype(np.float32)
+
+
+def _texture(image: Image.Image) -> NDArray[np.uint8]:
+    """The image as RGB with sides that are powers of two, so that mip levels halve exactly in every renderer."""
+    size = tuple(min(LARGEST_TEXTURE, 2 ** round(np.log2(side))) for side in image.size)
+    colour = image.convert("RGB")
+    return np.asarray(colour if colour.size == size else colour.resize(size, Image.Resampling.LANCZOS))
+
+
+def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1).
+
+    >>> srgb_to_linear(np.array([0.0, 0.5, 1.0])).round(4).tolist()
+    [0.0, 0.214, 1.0]
+    """
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,141 @@
+"""The data module: views of objects on disk, rendered first where need be, as batches of pairs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from lightning import LightningDataModule
+from numpy.typing import NDArray
+from rich.progress import track
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from lp_framework.data.cache import cached_array, content_key, decoded_views
+from lp_framework.data.pairs import BlockSampler, ListSampler, PairBatch, PairData, ViewTable, as_images
+from lp_framework.data.views import ObjectViews, object_names, read_views
+from lp_framework.errors import UserError
+
+EVALUATION_PAIRS = 224  # pairs a batch; four objects of eight test views
+
+
+class FeatureExtractor(Protocol):
+    """What the data module asks of a backbone in order to cache its features."""
+
+    trunk_dim: int
+
+    def trunk(self, images: Tensor) -> Tensor:
+        """Features `[I, trunk_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
+
+    def fingerprint(self) -> str:
+        """A text that changes when the trunk's output for some image would."""
+
+
+class PairDataModule(LightningDataModule):
+    """Ordered pairs among each object's views, from a folder of views.
+
+    `path` holds the views, `cache` the decoded ones (square, `image_size` pixels a side). A training batch has about
+    `batch_pairs` pairs over blocks of `block` views (see `BlockSampler`). `validation_views` of each object's training
+    views are held out to choose the best checkpoint; the test views are not touched before evaluation.
+    """
+
+    def __init__(
+        self, path: str, cache: str, image_size: int, batch_pairs: int, block: int, validation_views: int, seed: int
+    ) -> None:
+        super().__init__()
+        for name, value, least in (("image_size", image_size, 8), ("batch_pairs", batch_pairs, 1), ("block", block, 1)):
+            if value < least:
+                raise UserError(f"data.{name} must be at least {least}, got {value}")
+        if validation_views == 1 or validation_views < 0:
+            raise UserError(
+                f"data.validation_views must be 0 or at least 2, a pair needs two views; got {validation_views}"
+            )
+        self.path, self.cache = Path(path), Path(cache)
+        self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
+        self.validation_views, self.seed = validation_views, seed
+        self._extractor: FeatureExtractor | None = None
+        self._tables: dict[str, ViewTable] = {}
+
+    # ------------------------------------------------------------ what there is
+
+    def prepare_data(self) -> None:
+        """Make what is missing on disk, in one process: decoded views, cached features."""
+        for split in ("train", "test"):
+            self._arrays(self.table(split))
+
+    def table(self, split: str) -> ViewTable:
+        """All views of a split: "train" and "validation" (both from the training views on disk), or "test"."""
+        if split not in self._tables:
+            folder = "test" if split == "test" else "train"
+            views = [read_views(self.path, name, folder) for name in object_names(self.path)]
+            if split != "test" and self.validation_views:
+                views = [self._validation_split(each, held_out=split == "validation") for each in views]
+            self._tables[split] = ViewTable(views)
+        return self._tables[split]
+
+    def _validation_split(self, views: ObjectViews, held_out: bool) -> ObjectViews:
+        count = self.validation_views
+        if len(views) < count + 2:
+            raise UserError(
+                f"object '{views.name}' has {len(views)} training views; holding out data.validation_views={count} "
+                "leaves fewer than two to train on"
+            )
+        order = np.random.default_rng([self.seed, len(views)]).permutation(len(views))
+        kept = np.sort(order[:count] if held_out else order[count:])
+        files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
+        return replace(views, files=files, cameras=cameras)
+
+    def cache_features(self, extractor: FeatureExtractor) -> None:
+        """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
+        self._extractor = extractor
+
+    def _arrays(self, table: ViewTable) -> tuple[NDArray, NDArray | None]:
+        key, images = decoded_views(table.files, self.image_size, self.cache)
+        if self._extractor is None:
+            return images, None
+        extractor = self._extractor
+        shape = (len(images), extractor.trunk_dim)
+        feature_key = content_key([], "features", key, extractor.fingerprint())
+        return images, cached_array(
+            self.cache, feature_key, shape, np.float32, lambda array: _extract(extractor, images, array)
+        )
+
+    # ------------------------------------------------------------ batches
+
+    def data(self, split: str) -> PairData:
+        """The batches of a split, addressed by pairs."""
+        table = self.table(split)
+        return PairData(table, *self._arrays(table))
+
+    def _ranks(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def train_dataloader(self) -> DataLoader[PairBatch]:
+        """All ordered pairs of the training views once an epoch."""
+        data = self.data("train")
+        sampler = BlockSampler(data.table, self.batch_pairs, self.block, self.seed, *self._ranks())
+        return DataLoader(data, batch_size=None, sampler=sampler)
+
+    def val_dataloader(self) -> DataLoader[PairBatch] | list[DataLoader[PairBatch]]:
+        """All ordered pairs of the held-out training views, always in the same order."""
+        if not self.validation_views:
+            return []
+        return self._listed("validation", "ordered", self.batch_pairs)
+
+    def evaluation_dataloader(self, protocol: str, seed: int) -> DataLoader[PairBatch]:
+        """The pairs of an evaluation protocol, with images."""
+        return self._listed("train" if protocol == "ifusion" else "test", protocol, EVALUATION_PAIRS, seed)
+
+    def _listed(self, split: str, protocol: str, batch_pairs: int, seed: int = 0) -> DataLoader[PairBatch]:
+        data = self.data(split)
+        sampler = ListSampler(data.table.pairs(protocol, seed), batch_pairs, *self._ranks())
+        return DataLoader(data, batch_size=None, sampler=sampler)
+
+
+@torch.inference_mode()
+def _extract(extractor: FeatureExtractor, images: NDArray, array: NDArray, batch: int = 32) -> None:
+    for start in track(range(0, len(images), batch), description="computing features", transient=True):
+        array[start : start + batch] = extractor.trunk(as_images(images[start : start + batch])).numpy()

@@ -1,0 +1,217 @@
+"""Pairs of views: which pairs there are, how an epoch goes through them, and the batches that carry them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from lp_framework.data.views import ObjectViews
+from lp_framework.errors import UserError, nearest
+from lp_framework.geometry import relative_pose
+from lp_framework.keyed_random import stable_id
+
+PROTOCOLS = ("ordered", "per_view", "ifusion")
+
+
+@dataclass
+class PairBatch:
+    """P pairs among I views: every view is here once, pairs point to it.
+
+    `images` `[I, 3, H, W]` in [-1, 1], or `features` `[I, D]` that a frozen backbone computed from them; `poses`
+    `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`; `reference`, `query` `[P]`
+    into the views; `pairs` `[P]` indices of the pairs in the data set.
+    """
+
+    images: Tensor | None
+    features: Tensor | None
+    poses: Tensor
+    cameras: Tensor
+    objects: Tensor
+    reference: Tensor
+    query: Tensor
+    pairs: Tensor
+
+    def __len__(self) -> int:
+        return len(self.reference)
+
+    def relative_poses(self) -> Tensor:
+        """True relative poses `[P, 3]`, float32."""
+        return relative_pose(self.poses[self.reference], self.poses[self.query]).float()
+
+
+class ViewTable:
+    """All views of several objects in one split, numbered 0..N-1 object by object."""
+
+    def __init__(self, objects: Sequence[ObjectViews]) -> None:
+        self.objects = list(objects)
+        self.names = [views.name for views in objects]
+        self.ambiguities = [views.ambiguity for views in objects]
+        self.unique_answer = [views.unique_answer for views in objects]
+        self.files = [file for views in objects for file in views.files]
+        self.cameras = torch.cat([views.cameras for views in objects])
+        self.poses = torch.cat([views.poses for views in objects])
+        self.counts = [len(views) for views in objects]
+        self.object_of_view = torch.repeat_interleave(torch.arange(len(objects)), torch.tensor(self.counts))
+        self._starts = np.cumsum([0, *self.counts])
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def views_of(self, index: int) -> NDArray[np.int64]:
+        """Numbers of the views of object `index`."""
+        return np.arange(self._starts[index], self._starts[index + 1])
+
+    def pair_number(self, reference: NDArray[np.int64], query: NDArray[np.int64]) -> NDArray[np.int64]:
+        """A number for each ordered pair of views, unique in the table."""
+        return reference * len(self) + query
+
+    def pair_ids(self, numbers: Tensor) -> Tensor:
+        """Ids `[P]` of pairs by number: hashes of object and image names, the same whatever else the table holds."""
+        names = [f"{self.names[self.object_of_view[view]]}/{file.name}" for view, file in enumerate(self.files)]
+        pairs = [divmod(number, len(self)) for number in numbers.tolist()]
+        return torch.tensor([stable_id(f"{names[r]} {names[q]}") for r, q in pairs])
+
+    def pairs(self, protocol: str = "ordered", seed: int = 0) -> NDArray[np.int64]:
+        """Ordered pairs `[P, 2]` (reference, query) by a named protocol.
+
+        `ordered`: all ordered pairs of an object's views. `per_view`: each view once as query, its reference drawn
+        among the object's other views (the paper's denominators). `ifusion`: the 20 ordered pairs of the first five
+        views of an object (iFusion's script, which takes training views).
+        """
+        if protocol not in PROTOCOLS:
+            raise UserError(
+                f"protocol='{protocol}' is not known{nearest(protocol, PROTOCOLS)} (known: {', '.join(PROTOCOLS)})"
+            )
+        chosen = []
+        for index, name in enumerate(self.names):
+            views = self.views_of(index)
+            if len(views) < 2:
+                raise UserError(f"object '{name}' has {len(views)} view here; a pair needs two")
+            if protocol == "per_view":
+                random = np.random.default_rng([seed, index])
+                others = [random.choice(views[views != query]) for query in views]
+                chosen.append(np.stack([np.array(others), views], axis=1))
+                continue
+            if protocol == "ifusion":
+                views = views[:5]
+            reference, query = np.meshgrid(views, views, indexing="ij")
+            pairs = np.stack([reference.ravel(), query.ravel()], axis=1)
+            chosen.append(pairs[pairs[:, 0] != pairs[:, 1]])
+        return np.concatenate(chosen)
+
+
+class PairData(Dataset[PairBatch]):
+    """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves."""
+
+    def __init__(self, table: ViewTable, images: NDArray | None, features: NDArray | None) -> None:
+        self.table, self.images, self.features = table, images, features
+
+    def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
+        views, place = np.unique(pairs, return_inverse=True)
+        place = place.reshape(pairs.shape)
+        index = torch.from_numpy(views)
+        features = None if self.features is None else torch.from_numpy(self.features[views])
+        images = None if self.images is None or features is not None else as_images(self.images[views])
+        return PairBatch(
+            images=images,
+            features=features,
+            poses=self.table.poses[index],
+            cameras=self.table.cameras[index],
+            objects=self.table.object_of_view[index],
+            reference=torch.from_numpy(place[:, 0]),
+            query=torch.from_numpy(place[:, 1]),
+            pairs=torch.from_numpy(self.table.pair_number(pairs[:, 0], pairs[:, 1])),
+        )
+
+
+def as_images(pixels: NDArray) -> Tensor:
+    """Images `[I, 3, H, W]` in [-1, 1] from pixels `[I, H, W, 3]` (uint8)."""
+    return torch.from_numpy(np.ascontiguousarray(pixels)).permute(0, 3, 1, 2).float() / 127.5 - 1
+
+
+class BlockSampler(Sampler[NDArray[np.int64]]):
+    """All ordered pairs of every object once an epoch, arranged so that a batch has many pairs among few views.
+
+    The views of an object are shuffled and cut into blocks of B; a unit is two blocks with the 2 B^2 pairs across
+    them (a block's own pairs ride along once); a batch is a few units, of any objects. So a view that went through
+    the backbone once serves about B pairs of its batch. The order depends on (seed, epoch) alone.
+    """
+
+    def __init__(
+        self, table: ViewTable, batch_pairs: int, block: int, seed: int, rank: int = 0, ranks: int = 1
+    ) -> None:
+        self.table, self.block, self.seed = table, block, seed
+        self.rank, self.ranks = rank, ranks
+        self.units_per_batch = max(1, round(batch_pairs / (2 * block * block)))
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this at the start of every epoch."""
+        self.epoch = epoch
+
+    def _units(self, count: int) -> int:
+        blocks = -(-count // self.block)
+        return max(1, blocks * (blocks - 1) // 2)
+
+    def __len__(self) -> int:
+        units = sum(self._units(count) for count in self.table.counts)
+        return -(-units // self.units_per_batch // self.ranks)
+
+    def __iter__(self) -> Iterator[NDArray[np.int64]]:
+        random = np.random.default_rng([self.seed, self.epoch])
+        units = [unit for index in range(len(self.table.names)) for unit in self._object_units(index, random)]
+        order = random.permutation(len(units))
+        # Ranks take turns; all have the same number of batches, the last ones wrap around to the first.
+        for batch in range(len(self)):
+            first = (batch * self.ranks + self.rank) * self.units_per_batch
+            chosen = [order[place % len(order)] for place in range(first, first + self.units_per_batch)]
+            yield np.concatenate([units[unit] for unit in chosen])
+
+    def _object_units(self, index: int, random: np.random.Generator) -> list[NDArray[np.int64]]:
+        views = random.permutation(self.table.views_of(index))
+        blocks = [views[start : start + self.block] for start in range(0, len(views), self.block)]
+        own = [_within(block) for block in blocks]
+        if len(blocks) == 1:
+            return own
+        units = []
+        for i in range(len(blocks)):
+            for j in range(i):
+                # Each block's own pairs ride with exactly one unit: (i, i - 1) carries block i, (1, 0) also block 0.
+                extra = ([own[i]] if j == i - 1 else []) + ([own[0]] if (i, j) == (1, 0) else [])
+                units.append(np.concatenate([_across(blocks[i], blocks[j]), *extra]))
+        return units
+
+
+def _across(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    first, second = (grid.ravel() for grid in np.meshgrid(a, b, indexing="ij"))
+    return np.concatenate([np.stack([first, second], axis=1), np.stack([second, first], axis=1)])
+
+
+def _within(views: NDArray[np.int64]) -> NDArray[np.int64]:
+    first, second = (grid.ravel() for grid in np.meshgrid(views, views, indexing="ij"))
+    return np.stack([first, second], axis=1)[first != second]
+
+
+class ListSampler(Sampler[NDArray[np.int64]]):
+    """Given pairs `[P, 2]` in order, in batches of whole objects' runs, shared out over processes.
+
+    Processes get equally many batches; where the number does not divide, the last ones repeat earlier batches, and
+    the metrics count a pair once.
+    """
+
+    def __init__(self, pairs: NDArray[np.int64], batch_pairs: int, rank: int = 0, ranks: int = 1) -> None:
+        batches = [pairs[start : start + batch_pairs] for start in range(0, len(pairs), batch_pairs)]
+        rounds = -(-len(batches) // ranks)
+        self.batches = [batches[(step * ranks + rank) % len(batches)] for step in range(rounds)]
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[NDArray[np.int64]]:
+        return iter(self.batches)

@@ -1,0 +1,156 @@
+"""`renderer=pyrender`: OpenGL without a display, by EGL or OSMesa.
+
+pyrender's shader has a physically based material; with metalness 0 and roughness 1 it comes to a Lambertian surface
+with a faint sheen. It decodes textures from sRGB and multiplies vertex colours, taken as linear, onto the lit result.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from lp_framework.data.meshes import Surface, surfaces
+from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, downsample
+from lp_framework.errors import UserError
+from lp_framework.registry import register
+
+if TYPE_CHECKING:
+    import pyrender
+
+PLATFORMS = ("egl", "osmesa")
+NEAR, FAR = 0.01, 100.0  # scene units
+
+
+@register("renderer", "pyrender")
+class PyrenderRenderer(Renderer):
+    """OpenGL without a display (EGL, else OSMesa), in software or on a GPU."""
+
+    name = "pyrender"
+
+    def views(
+        self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
+    ) -> Iterator[NDArray[np.uint8]]:
+        """See `Renderer.views`."""
+        context = offscreen_context()
+        import pyrender
+
+        camera = pyrender.PerspectiveCamera(yfov=np.radians(field_of_view_degrees), znear=NEAR, zfar=FAR)
+        stage = pyrender.Scene(bg_color=[0, 0, 0, 0], ambient_light=[AMBIENT] * 3)
+        stage.add(pyrender.Mesh(_primitives(surfaces(scene))))
+        camera_node = stage.add(camera)
+        for light in LIGHTS:
+            source = pyrender.DirectionalLight(color=[1.0, 1.0, 1.0], intensity=light.intensity)
+            stage.add(source, pose=_pose_towards(light.towards), parent_node=camera_node)
+        for pose in np.asarray(camera_to_world, dtype=np.float64):
+            stage.set_pose(camera_node, pose)
+            context.viewport_width = context.viewport_height = resolution * SUPERSAMPLING
+            samples, _ = context.render(stage, flags=pyrender.RenderFlags.RGBA)
+            yield downsample(samples)
+
+
+def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
+    """Every triangle twice, the second time turned over with its normals; culling then leaves the side in view.
+
+    A triangle that another one backs has its other side there already.
+    """
+    import pyrender
+
+    primitives = []
+    for surface in parts:
+        texture = None
+        if surface.texture is not None:
+            texture = pyrender.Texture(source=surface.texture, source_channels="RGB")
+        material = pyrender.MetallicRoughnessMaterial(
+            baseColorFactor=[*surface.colour, 1.0], baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0
+        )
+        corners = np.arange(len(surface.positions)).reshape(-1, 3)
+        turned = corners[surface.twins < 0, ::-1]
+        for order, sign in ((corners.reshape(-1), 1), (turned.reshape(-1), -1)):
+            if not len(order):
+                continue
+            attributes = [surface.positions[order], sign * surface.normals[order]]
+            if surface.texture_coordinates is not None:
+                attributes.append(surface.texture_coordinates[order])
+            if surface.corner_colours is not None:
+                attributes.append(surface.corner_colours[order])
+            shared, index = _shared_corners(np.hstack(attributes))
+            primitives.append(
+                pyrender.Primitive(
+                    positions=shared[:, :3],
+                    normals=shared[:, 3:6],
+                    texcoord_0=None if surface.texture_coordinates is None else shared[:, 6:8],
+                    color_0=None if surface.corner_colours is None else shared[:, -3:],
+                    indices=index.reshape(-1, 3),
+                    material=material,
+                )
+            )
+    return primitives
+
+
+def _shared_corners(corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The distinct rows, and the index of each row among them: OpenGL then transforms each only once."""
+    rows = np.ascontiguousarray(corners).view(np.dtype((np.void, corners.itemsize * corners.shape[1]))).reshape(-1)
+    _, first, index = np.unique(rows, return_index=True, return_inverse=True)
+    return corners[first], index
+
+
+def _pose_towards(towards: tuple[float, float, float]) -> NDArray[np.float64]:
+    """A pose whose +Z axis, against which pyrender's light shines, is the given direction."""
+    return trimesh.geometry.align_vectors([0, 0, 1], towards)
+
+
+# ---------------------------------------------------------------- the context
+
+
+@cache
+def offscreen_context() -> pyrender.OffscreenRenderer:
+    """The process's one OpenGL context; `UserError` where there is none to be had.
+
+    One for all, because closing any context of pyrender's closes its display, and with it the others.
+    """
+    chosen = os.environ.get("PYOPENGL_PLATFORM")
+    reasons = []
+    for platform in (chosen,) if chosen else PLATFORMS:
+        os.environ["PYOPENGL_PLATFORM"] = platform
+        try:
+            return _open_context()
+        except Exception as error:  # missing library, no device, no driver: each fails in its own way
+            reasons.append(f"{platform}: {type(error).__name__}: {error}")
+            _forget_opengl()
+    if not chosen:
+        del os.environ["PYOPENGL_PLATFORM"]
+    raise UserError(
+        f"renderer=pyrender finds no OpenGL on this machine ({'; '.join(reasons)}); "
+        "install libegl1 with a Mesa driver or libosmesa6, or choose renderer=raycast"
+    )
+
+
+def _open_context() -> pyrender.OffscreenRenderer:
+    import pyrender
+
+    _turn_off_multisampling(pyrender.renderer)
+    return pyrender.OffscreenRenderer(64, 64)
+
+
+def _forget_opengl() -> None:
+    """PyOpenGL binds to a platform when it is first imported: import it afresh, so that the next one has a chance."""
+    for module in [name for name in sys.modules if name.partition(".")[0] in ("OpenGL", "pyrender")]:
+        del sys.modules[module]
+
+
+def _turn_off_multisampling(module: Any) -> None:
+    """Four samples a pixel are a fixed number in pyrender. We supersample by ourselves, as raycast does, which
+    leaves each sample either opaque or clear; with both, a view would take software OpenGL three times as long."""
+    allocate = module.glRenderbufferStorageMultisample
+
+    def single_sampled(target: int, _samples: int, format: int, width: int, height: int) -> None:
+        allocate(target, 0, format, width, height)
+
+    module.glRenderbufferStorageMultisample = single_sampled

@@ -1,0 +1,71 @@
+"""What every renderer keeps to: the interface, the light and the anti-aliasing.
+
+The light is fixed to the camera, not to the object: were it fixed to the object, its shading would tell the longitude
+of a body of revolution, and the symmetry of an object would be no ambiguity any more.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+SUPERSAMPLING = 2  # samples a pixel along each side
+
+
+class Light(NamedTuple):
+    """Parallel light: the vector towards it in the camera's frame (+X right, +Y up, +Z back), and its intensity."""
+
+    towards: tuple[float, float, float]
+    intensity: float
+
+
+KEY = Light((-0.6, 0.8, 1.1), 2.5)  # upper left, behind the camera
+FILL = Light((1.0, 0.1, 0.7), 0.65)  # right
+LIGHTS = (KEY, FILL)
+AMBIENT = 0.2
+
+
+class Renderer(ABC):
+    """Draws views of scenes; pickled to worker processes, hence without state that cannot travel."""
+
+    name: str
+
+    @abstractmethod
+    def views(
+        self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Views of a scene, one `[H, W, 4]` after the other, H = W = `resolution`: RGBA with straight alpha,
+        transparent where the scene is not.
+
+        `camera_to_world` is `[V, 4, 4]`, OpenGL style (array or CPU tensor); pixels are square, the optical axis meets
+        the image's centre. What needs to be set up for the scene is set up once. Surfaces are opaque and seen from
+        both sides. Raises `UserError` where the renderer cannot work on this machine.
+        """
+
+    def render(
+        self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
+    ) -> NDArray[np.uint8]:
+        """All `views` at once, `[V, H, W, 4]`."""
+        return np.stack(list(self.views(scene, camera_to_world, resolution, field_of_view_degrees)))
+
+
+def downsample(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pixels `[H, W, 4]` with straight alpha from samples `[H s, W s, 4]` with premultiplied alpha, s = SUPERSAMPLING.
+
+    The mean over each pixel is taken with premultiplied alpha, so that no background bleeds into the edges.
+    """
+    height, width = samples.shape[0] // SUPERSAMPLING, samples.shape[1] // SUPERSAMPLING
+    sums = np.zeros((height, width, 4), np.uint16)
+    for row in range(SUPERSAMPLING):
+        for column in range(SUPERSAMPLING):
+            sums += samples[row::SUPERSAMPLING, column::SUPERSAMPLING]
+    alpha = sums[..., 3:].astype(np.float32)
+    pixels = np.empty((height, width, 4), np.uint8)
+    pixels[..., :3] = np.minimum(sums[..., :3] * (255 / np.maximum(alpha, 1)) + 0.5, 255)
+    pixels[..., 3:] = alpha / SUPERSAMPLING**2 + 0.5
+    return pixels

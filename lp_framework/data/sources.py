@@ -1,0 +1,117 @@
+"""The data sets by name: the embedded objects, a folder of meshes, a folder of views."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import trimesh
+
+from lp_framework.data.meshes import MeshObject, load_scene
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.rendering.renderer import Renderer
+from lp_framework.data.rendering.views import ViewProtocol, render_objects
+from lp_framework.data.toy import toy_objects
+from lp_framework.errors import UserError
+from lp_framework.registry import register
+
+
+class RenderedData(PairDataModule):
+    """Views that are rendered from meshes on first use, by the paper's protocol."""
+
+    renderer: Renderer
+    protocol: ViewProtocol
+    workers: int | None
+
+    def objects(self) -> list[MeshObject]:
+        """The objects to render."""
+        raise NotImplementedError
+
+    def prepare_data(self) -> None:
+        """Render what is missing, then as every data set."""
+        self.render()
+        super().prepare_data()
+
+    def render(self) -> None:
+        """Render the objects that are not there yet."""
+        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers)
+
+
+@register("data", "toy")
+class ToyData(RenderedData):
+    """Twelve embedded objects that this package makes: six unique, three twofold, three continuous."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        path: str = "datasets/toy",
+        resolution: int = 256,
+        test_views: int = 8,
+        workers: int | None = None,
+        cache: str = "datasets/cache",
+        image_size: int = 256,
+        batch_pairs: int = 1024,
+        block: int = 8,
+        validation_views: int = 8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(path, cache, image_size, batch_pairs, block, validation_views, seed)
+        self.renderer, self.workers = renderer, workers
+        self.protocol = ViewProtocol(resolution=resolution, test_views=test_views)
+
+    def objects(self) -> list[MeshObject]:
+        """The embedded objects."""
+        return toy_objects()
+
+
+@register("data", "meshes")
+class MeshData(RenderedData):
+    """A folder of meshes, in any formats that trimesh reads; rendered into `views`."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        path: str,
+        views: str | None = None,
+        resolution: int = 512,
+        test_views: int = 8,
+        workers: int | None = None,
+        cache: str = "datasets/cache",
+        image_size: int = 256,
+        batch_pairs: int = 1024,
+        block: int = 8,
+        validation_views: int = 8,
+        seed: int = 0,
+    ) -> None:
+        self.meshes = Path(path)
+        folder = views if views is not None else f"datasets/{self.meshes.resolve().name}"
+        super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
+        self.renderer, self.workers = renderer, workers
+        self.protocol = ViewProtocol(resolution=resolution, test_views=test_views)
+
+    def objects(self) -> list[MeshObject]:
+        """One object a mesh file, named after it, sorted by name."""
+        if not self.meshes.is_dir():
+            raise UserError(f"{self.meshes}: there is no such folder of meshes; give data.path=FOLDER")
+        formats = {f".{suffix}" for suffix in trimesh.available_formats()}
+        files = sorted(file for file in self.meshes.iterdir() if file.suffix.lower() in formats)
+        if not files:
+            raise UserError(f"{self.meshes}: holds no mesh file (known formats: {', '.join(sorted(formats))})")
+        return [MeshObject(file.stem, "unlabelled", partial(load_scene, file)) for file in files]
+
+
+@register("data", "renderings")
+class RenderingsData(PairDataModule):
+    """A folder of views in iFusion's layout, such as its published renderings of GSO and OO3D."""
+
+    def __init__(
+        self,
+        path: str,
+        cache: str = "datasets/cache",
+        image_size: int = 256,
+        batch_pairs: int = 1024,
+        block: int = 8,
+        validation_views: int = 8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(path, cache, image_size, batch_pairs, block, validation_views, seed)

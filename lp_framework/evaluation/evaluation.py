@@ -1,0 +1,63 @@
+"""Evaluation: a solver on the pairs of a protocol, its errors gathered into metrics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from torch import Tensor
+from torchmetrics import SumMetric
+
+from lp_framework.data.pairs import PairBatch, ViewTable
+from lp_framework.evaluation.metrics import PoseMetrics
+from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, translation_error
+from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.starts import Starts
+
+
+class Evaluation(LightningModule):
+    """Runs a solver under `Trainer.test`, so on any number of devices and processes.
+
+    Afterwards `result` gives the metrics (see `PoseMetrics`), `metrics.rows()` a row a pair.
+    """
+
+    def __init__(self, solver: Solver, starts: Starts, table: ViewTable, seed: int) -> None:
+        super().__init__()
+        self.solver, self.starts, self.table, self.seed = solver, starts, table, seed
+        # Registered, so that Lightning moves the networks of the solver to the device.
+        self.networks = torch.nn.ModuleList(part for part in vars(solver).values() if isinstance(part, torch.nn.Module))
+        self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer)
+        self.solved, self.seconds, self.passes = SumMetric(), SumMetric(), SumMetric()
+
+    def test_step(self, batch: PairBatch, batch_idx: int) -> None:
+        assert batch.images is not None  # evaluation never caches features
+        ids = self.table.pair_ids(batch.pairs).to(self.device)
+        pairs = Pairs(batch.images, batch.reference, batch.query, ids)
+        solution = self.solver.solve(pairs, self.starts.make(ids, self.seed), self.seed)
+        rotation, translation = errors(solution, batch)
+        poses = solution.answer().double()
+        self.metrics.update(batch.pairs, batch.objects[batch.reference], rotation, translation, solution.chosen, poses)
+        self.solved.update(len(batch))
+        self.seconds.update(solution.cost.seconds)
+        self.passes.update(solution.cost.network_passes)
+
+    def result(self) -> dict[str, Any]:
+        """The metrics with the cost: seconds and network passes a pair."""
+        solved = self.solved.compute()
+        return {
+            **self.metrics.compute(),
+            "seconds_per_pair": (self.seconds.compute() / solved).item(),
+            "network_passes_per_pair": (self.passes.compute() / solved).item(),
+        }
+
+
+def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
+    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one."""
+    if solution.cameras is None:
+        reference = batch.poses[batch.reference][:, None].double()
+        predicted = camera_to_world(apply_relative_pose(reference, solution.poses.double()))
+    else:
+        predicted = solution.cameras.double()
+    true = batch.cameras[batch.query][:, None].expand_as(predicted)
+    return rotation_error(predicted, true), translation_error(predicted, true)

@@ -1,0 +1,106 @@
+"""Recall, success rate and median errors (paper, Evaluation Metrics), correct across processes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+from lp_framework.models.pair_mean import first_of_each
+
+ROTATION_THRESHOLDS = (5, 15, 30)  # degrees
+TRANSLATION_THRESHOLD = 0.2  # in units of the object's longest side
+STATES = ("pair", "object", "rotation", "translation", "chosen", "answer")
+
+
+def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str, float]:
+    """The metrics of P pairs with N starts: errors `[P, N]` (degrees, scene units), chosen start `[P]`.
+
+    R@d: share of pairs whose chosen start is within d degrees and 0.2; R(R)@d by rotation alone; SR, SR(R): the same
+    over all starts. The errors are medians over the chosen starts. What is NaN counts as a failure.
+
+    >>> summary = summarise(torch.tensor([[4.0, 90.0]]), torch.tensor([[0.3, 2.0]]), torch.tensor([0]))
+    >>> summary["R@5"], summary["R(R)@5"], summary["SR(R)@5"]
+    (0.0, 1.0, 0.5)
+    """
+    rotation, translation = rotation.nan_to_num(nan=torch.inf), translation.nan_to_num(nan=torch.inf)
+    pick = chosen[:, None]
+    metrics: dict[str, float] = {}
+    for prefix, degrees, distance in (
+        ("R", rotation.gather(1, pick), translation.gather(1, pick)),
+        ("SR", rotation, translation),
+    ):
+        for threshold in ROTATION_THRESHOLDS:
+            turned = degrees <= threshold
+            metrics[f"{prefix}@{threshold}"] = (turned & (distance <= TRANSLATION_THRESHOLD)).double().mean().item()
+            metrics[f"{prefix}(R)@{threshold}"] = turned.double().mean().item()
+    # quantile, because `median` takes the lower one of an even count.
+    metrics["rotation_error"] = rotation.gather(1, pick).double().quantile(0.5).item()
+    metrics["translation_error"] = translation.gather(1, pick).double().quantile(0.5).item()
+    return metrics
+
+
+class PoseMetrics(Metric):
+    """Gathers a row a pair; `compute` gives the metrics overall, over objects with a unique answer, per object, and
+    per ambiguity class.
+
+    `names`, `ambiguities` and `unique_answer` describe the objects by index; `unique_answer` is None where unknown.
+    """
+
+    full_state_update = False
+    pair: list[Tensor]
+    object: list[Tensor]
+    rotation: list[Tensor]
+    translation: list[Tensor]
+    chosen: list[Tensor]
+    answer: list[Tensor]
+
+    def __init__(
+        self, names: Sequence[str], ambiguities: Sequence[str], unique_answer: Sequence[bool | None], **arguments: Any
+    ) -> None:
+        super().__init__(**arguments)
+        self.names, self.ambiguities, self.unique_answer = list(names), list(ambiguities), list(unique_answer)
+        for state in STATES:
+            self.add_state(state, [], dist_reduce_fx="cat")
+
+    def update(
+        self, pair: Tensor, object: Tensor, rotation: Tensor, translation: Tensor, chosen: Tensor, answer: Tensor
+    ) -> None:
+        """Add pairs numbered `[P]` of objects `[P]`: errors `[P, N]` (degrees, scene units), chosen start `[P]` and its
+        relative pose `[P, 3]`.
+        """
+        for state, value in zip(STATES, (pair, object, rotation, translation, chosen, answer), strict=True):
+            getattr(self, state).append(value)
+
+    def rows(self) -> dict[str, Tensor]:
+        """One row a pair, by ascending pair number, each pair once."""
+        rows = {state: dim_zero_cat(getattr(self, state)).cpu() for state in STATES}
+        order = first_of_each(rows["pair"])
+        return {state: value[order] for state, value in rows.items()}
+
+    def compute(self) -> dict[str, Any]:
+        """`metrics`, `metrics_unique_answer` (None where no object is labelled so), `per_object`, `per_ambiguity`."""
+        rows = self.rows()
+
+        def over(objects: Sequence[int]) -> dict[str, float] | None:
+            mask = torch.isin(rows["object"], torch.tensor(list(objects)))
+            if not mask.any():
+                return None
+            return summarise(rows["rotation"][mask], rows["translation"][mask], rows["chosen"][mask])
+
+        everything = range(len(self.names))
+        unique = [index for index in everything if self.unique_answer[index]]
+        classes = sorted(set(self.ambiguities), key=["unique", "twofold", "continuous", "unlabelled"].index)
+        return {
+            "metrics": over(everything),
+            "metrics_unique_answer": over(unique) if unique else None,
+            "per_object": {self.names[index]: over([index]) for index in everything},
+            "per_ambiguity": {
+                name: over([index for index in everything if self.ambiguities[index] == name]) for name in classes
+            },
+            "pairs": len(rows["pair"]),
+        }

@@ -1,0 +1,112 @@
+"""Results as tables: in the terminal in the paper's layout, and on disk as JSON and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from lp_framework.data.pairs import ViewTable
+from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, PoseMetrics
+
+COLUMNS = [f"{prefix}@{degrees}" for prefix in ("R", "R(R)", "SR", "SR(R)") for degrees in ROTATION_THRESHOLDS]
+ERRORS = ["rotation_error", "translation_error"]
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON whole or not at all; what is not finite becomes null."""
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(key): finite(each) for key, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [finite(each) for each in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    write_text(path, json.dumps(finite(content), indent=2) + "\n")
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write CSV whole or not at all."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def summary_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, float]]]:
+    """The rows of the summary: all objects, those with a unique answer, each ambiguity class; empty ones left out."""
+    rows = [("all objects", result["metrics"]), ("unique answer", result["metrics_unique_answer"])]
+    rows += [
+        (f"  {name}", metrics) for name, metrics in result["per_ambiguity"].items() if len(result["per_ambiguity"]) > 1
+    ]
+    return [(name, metrics) for name, metrics in rows if metrics is not None]
+
+
+def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) -> Table:
+    """The paper's layout: at each threshold R and R(R), then SR and SR(R), then the median errors."""
+    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False, padding=(0, 1))
+    table.add_column("", no_wrap=True)
+    order = []
+    for all_starts in (False, True):
+        prefix = "SR" if all_starts else "R"
+        for degrees in ROTATION_THRESHOLDS:
+            for name, label in (
+                (f"{prefix}@{degrees}", f"@{degrees}\n{prefix}"),
+                (f"{prefix}(R)@{degrees}", f"\n{prefix}(R)"),
+            ):
+                order.append(name)
+                table.add_column(label, justify="right", min_width=4)
+    table.add_column("Rot.\n(deg)", justify="right")
+    table.add_column("Trans.", justify="right")
+    for name, metrics in rows:
+        shares = [f"{metrics[key]:.2f}".replace("0.", ".", 1) if metrics[key] < 0.995 else "1.0" for key in order]
+        table.add_row(name, *shares, f"{metrics['rotation_error']:.1f}", f"{metrics['translation_error']:.2f}")
+    return table
+
+
+def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, table: ViewTable) -> None:
+    """`results.json`, `results.csv` (a row an object and summary row) and `pairs.csv` (a row a pair) in `folder`."""
+    write_json(folder / "results.json", result)
+    rows = [*summary_rows(result), *((name, row) for name, row in result["per_object"].items() if row is not None)]
+    keys = [*COLUMNS, *ERRORS]
+    write_csv(
+        folder / "results.csv", ["name", *keys], [[name.strip(), *(row[key] for key in keys)] for name, row in rows]
+    )
+    write_csv(folder / "pairs.csv", PAIR_COLUMNS, pair_rows(metrics, table))
+
+
+PAIR_COLUMNS = (
+    "object", "ambiguity", "reference", "query", "rotation_error_degrees", "translation_error", "chosen_start",
+    "latitude_degrees", "longitude_degrees", "relative_radius",
+)  # fmt: skip
+
+
+def pair_rows(metrics: PoseMetrics, table: ViewTable) -> list[list[object]]:
+    """A row a pair with the answer (relative pose, degrees) and its errors."""
+    rows = metrics.rows()
+    lines: list[list[object]] = []
+    for line in range(len(rows["pair"])):
+        reference, query = divmod(int(rows["pair"][line]), len(table))
+        index, chosen = int(rows["object"][line]), int(rows["chosen"][line])
+        latitude, longitude, radius = rows["answer"][line].tolist()
+        errors = [round(float(rows[key][line, chosen]), 5) for key in ("rotation", "translation")]
+        pose = [round(math.degrees(latitude), 4), round(math.degrees(longitude), 4), round(radius, 5)]
+        files = [table.files[reference].name, table.files[query].name]
+        lines.append([table.names[index], table.ambiguities[index], *files, *errors, chosen, *pose])
+    return lines

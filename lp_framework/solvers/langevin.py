@@ -1,0 +1,94 @@
+"""The paper's first stage: Langevin-like descent of a learned score (Eq. 4, Two Stage Optimization)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from lp_framework.errors import UserError
+from lp_framework.geometry import wrap_angle
+from lp_framework.keyed_random import keyed_normal
+from lp_framework.models.pose_model import PoseModel
+from lp_framework.registry import register
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, as_triple, check_starts, choose
+
+
+@register("solver", "langevin")
+class Langevin(Solver):
+    """First stage alone: x <- x + alpha s(x) + gamma z on a score or energy model, for all starts of all pairs."""
+
+    def __init__(
+        self,
+        model: PoseModel,
+        alpha: float = 0.1,
+        gamma: float | Sequence[float] = (0.0, 0.3, 0.0),
+        iterations: int = 50,
+        choose_by: Literal["score_norm", "agreement", "energy"] = "score_norm",
+        trajectory: bool = False,
+    ) -> None:
+        if not 0 < alpha < 2:
+            raise UserError(f"solver.alpha must lie between 0 and 2 for the update to converge, got {alpha}")
+        if iterations < 0:
+            raise UserError(f"solver.iterations must not be negative, got {iterations}")
+        if choose_by == "energy" and model.outputs != 1:
+            raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use score_norm")
+        self.model = model
+        self.alpha, self.gamma = alpha, as_triple("solver.gamma", gamma)
+        self.iterations, self.choose_by, self.trajectory = iterations, choose_by, trajectory
+
+    @torch.no_grad()
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        """See `Solver.solve`. A start is invalid when its pose is not finite."""
+        check_starts(pairs, starts)
+        began = time.perf_counter()
+        features = self.model.encode(pairs.images)
+        condition = self.model.condition(features[pairs.reference], features[pairs.query])[:, None]  # [B, 1, hidden]
+        pose, path = starts, [starts]
+        noise = self._noise(pairs, starts.shape[1], seed).to(starts)
+        for step in range(self.iterations):
+            pose = pose + self.alpha * self.model.field(condition, pose).score + noise[:, :, step]
+            if self.trajectory:
+                path.append(pose)
+        final = self.model.field(condition, pose)
+        energies = self._energies(pose, final.score, final.energy)
+        passes = len(pairs.images) + starts.shape[0] * starts.shape[1] * (self.iterations + 1)
+        reduced = pose.clone()
+        reduced[..., 1] = wrap_angle(pose[..., 1]) % (2 * math.pi)
+        return Solution(
+            poses=reduced,
+            energies=energies,
+            valid=pose.isfinite().all(dim=-1),
+            chosen=choose(energies),
+            cost=Cost(network_passes=passes, seconds=time.perf_counter() - began),
+            trajectory=torch.stack(path, dim=2) if self.trajectory else None,
+        )
+
+    def _noise(self, pairs: Pairs, starts: int, seed: int) -> Tensor:
+        """G z_t for every start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""
+        if not any(self.gamma):
+            return torch.zeros(len(pairs), starts, self.iterations, 3, device=pairs.ids.device)
+        number = torch.arange(starts, device=pairs.ids.device)
+        draws = keyed_normal(seed, pairs.ids[:, None], number, count=3 * self.iterations)
+        gamma = torch.tensor(self.gamma, dtype=draws.dtype, device=draws.device)
+        return draws.view(len(pairs), starts, self.iterations, 3) * gamma
+
+    def _energies(self, pose: Tensor, score: Tensor, energy: Tensor | None) -> Tensor:
+        """By what the answer is chosen, `[B, N]`.
+
+        `score_norm`: the distance that the model itself still sees, |s| = |x - x_gt| / sigma^2 for an exact score: with
+        noise it picks the start that ended nearest. `agreement`: the median distance to the other starts' ends.
+        `energy`: the energy model's.
+        """
+        if self.choose_by == "energy":
+            assert energy is not None  # of the constructor's check
+            return energy
+        if self.choose_by == "score_norm":
+            return score.norm(dim=-1)
+        offset = pose[:, :, None] - pose[:, None]
+        offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
+        return offset.norm(dim=-1).median(dim=-1).values

@@ -1,0 +1,75 @@
+"""Starts: the initial relative poses from which a solver descends."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lp_framework.errors import UserError
+from lp_framework.keyed_random import keyed_uniform
+from lp_framework.registry import register
+
+_STARTS = 0x5747  # separates the draws of starts from a solver's own under the same seed
+
+
+class Starts(ABC):
+    """Makes N starts a pair."""
+
+    @abstractmethod
+    def make(self, ids: Tensor, seed: int) -> Tensor:
+        """Starts `[B, N, 3]` (radians, radians, scene units; radius relative) for pairs with ids `[B]`, float32."""
+
+
+@register("start", "ring")
+class Ring(Starts):
+    """`count` longitudes evenly around the object, at one latitude (radians); iFusion's are 0, 90, 180, 270 degrees."""
+
+    def __init__(self, count: int = 4, latitude: float = 0.0) -> None:
+        if count < 1:
+            raise UserError(f"start.count must be at least 1, got {count}")
+        self.count, self.latitude = count, latitude
+
+    def make(self, ids: Tensor, seed: int) -> Tensor:
+        longitude = torch.arange(self.count, device=ids.device) * (2 * math.pi / self.count)
+        poses = torch.stack([torch.full_like(longitude, self.latitude), longitude, torch.zeros_like(longitude)], dim=-1)
+        return poses.expand(len(ids), -1, -1)
+
+
+@register("start", "grid")
+class Grid(Starts):
+    """Latitudes times longitudes (degrees); the paper's nine: -30, 0, 30 times 0, 120, 240."""
+
+    def __init__(
+        self,
+        latitudes_degrees: Sequence[float] = (-30.0, 0.0, 30.0),
+        longitudes_degrees: Sequence[float] = (0.0, 120.0, 240.0),
+    ) -> None:
+        if not latitudes_degrees or not longitudes_degrees:
+            raise UserError("start.latitudes_degrees and start.longitudes_degrees need at least one angle each")
+        self.latitudes, self.longitudes = list(latitudes_degrees), list(longitudes_degrees)
+
+    def make(self, ids: Tensor, seed: int) -> Tensor:
+        poses = [(math.radians(a), math.radians(b), 0.0) for a in self.latitudes for b in self.longitudes]
+        return torch.tensor(poses, device=ids.device).expand(len(ids), -1, -1)
+
+
+@register("start", "random")
+class Random(Starts):
+    """`count` starts drawn uniformly: latitude within `latitude` (radians) of 0, any longitude, relative radius 0."""
+
+    def __init__(self, count: int = 4, latitude: float = math.pi / 6) -> None:
+        if count < 1:
+            raise UserError(f"start.count must be at least 1, got {count}")
+        if not 0 <= latitude < math.pi / 2:
+            raise UserError(f"start.latitude must lie in [0, pi/2), got {latitude}")
+        self.count, self.latitude = count, latitude
+
+    def make(self, ids: Tensor, seed: int) -> Tensor:
+        number = torch.arange(self.count, device=ids.device)
+        uniform = keyed_uniform(seed, _STARTS, ids[:, None], number, count=2)
+        latitude, longitude = (2 * uniform[..., 0] - 1) * self.latitude, uniform[..., 1] * 2 * math.pi
+        return torch.stack([latitude, longitude, torch.zeros_like(latitude)], dim=-1).float()

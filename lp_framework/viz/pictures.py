@@ -1,0 +1,2 @@
+def save_pictures(folder, evaluation, data):
+    return []
