@@ -9,7 +9,7 @@ import importlib.metadata
 import os
 import sys
 
-from lp_framework import torchvision_ops
+
 from lp_framework.errors import UserError, nearest
 
 COMMANDS = {  # the module of a command is lp_framework.commands.NAME
@@ -32,7 +32,6 @@ EXAMPLES = {
 
 def main() -> int:
     """Run the command of `sys.argv`; the exit status: 0, 1 for bad input, 2 for a command line that makes no sense."""
-    torchvision_ops.install()
     command, *arguments = sys.argv[1:] or ["--help"]
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"  # the user asks for tracebacks
     try:

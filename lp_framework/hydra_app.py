@@ -113,12 +113,21 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
         except Exception:
             log.log(logging.ERROR if sweep else logging.INFO, "%s failed", command, exc_info=True)
             raise
-        finally:  # Lightning leaves the ranks of its processes there, and a sweep's next job would take them for its own
-            os.environ.clear()
-            os.environ.update(environment)
+        finally:
+            if sweep:
+                _forget_processes(environment)
 
     task.__module__ = f"lp_framework.commands.{command}"  # gives the job its name
     return task
+
+
+def _forget_processes(environment: dict[str, str]) -> None:
+    """Undo what Lightning leaves of a job's several processes; the sweep's next job would take it for its own."""
+    os.environ.clear()
+    os.environ.update(environment)
+    distributed = sys.modules.get("torch.distributed")
+    if distributed is not None and distributed.is_available() and distributed.is_initialized():
+        distributed.destroy_process_group()
 
 
 def _options(arguments: Sequence[str]) -> dict[str, str]:

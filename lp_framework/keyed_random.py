@@ -54,7 +54,8 @@ def keyed_uniform(*keys: Tensor | int, count: int) -> Tensor:
     >>> keyed_uniform(0, torch.tensor([7, 7, 8]), count=2)[:, 0].diff().tolist()[0]
     0.0
     """
-    return (_shift(keyed_bits(*keys, count=count), 11).double() + 0.5) * 2.0**-53
+    # 52 bits: with 53 the half is rounded away, and the largest draw is 1 itself.
+    return (_shift(keyed_bits(*keys, count=count), 12).double() + 0.5) * 2.0**-52
 
 
 def keyed_normal(*keys: Tensor | int, count: int) -> Tensor:

@@ -3,16 +3,53 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import platform
 import subprocess
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from lp_framework import registry
 from lp_framework.data.module import PairDataModule
+
+log = logging.getLogger(__name__)
+
+# Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
+OF_NO_USE = (
+    r"The '\w+' does not have many workers",  # batches come from memory, in this process
+    r"`isinstance\(treespec, LeafSpec\)` is deprecated",
+    r"The number of training batches .* is smaller than the logging interval",
+    r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk
+    r"Experiment logs directory .* exists and is not empty",  # it is the run's folder
+    r"Checkpoint directory .* exists and is not empty",
+)
+
+
+@contextmanager
+def orderly_console() -> Iterator[None]:
+    """Lightning's notes go to the run's log alone; warnings go to the log and, one line each, to the console."""
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        notes = logging.getLogger(name)
+        notes.handlers.clear()  # Hydra's handlers, above it, take over
+        notes.propagate = True
+
+    def show(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int,
+        file: TextIO | None = None, line: str | None = None,
+    ) -> None:  # fmt: skip
+        log.warning("%s", " ".join(str(message).split()))
+
+    with warnings.catch_warnings():
+        for beginning in OF_NO_USE:
+            warnings.filterwarnings("ignore", beginning)
+        warnings.showwarning = show
+        yield
 
 
 def build_data(config: DictConfig) -> PairDataModule:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from lp_framework import registry
-from lp_framework.commands.building import build_data, plain, run_folder, versions
+from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint, load_model, newest_checkpoint
 from lp_framework.viz.pictures import save_pictures
 
 
+@orderly_console()
 def run(config: DictConfig) -> None:
     """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder."""
     folder = run_folder()
@@ -42,10 +42,7 @@ def run(config: DictConfig) -> None:
     split = "train" if config.protocol == "ifusion" else "test"
     evaluation = Evaluation(solver, starts, data.table(split), config.seed)
     loader = data.evaluation_dataloader(config.protocol, config.seed)
-    with warnings.catch_warnings():
-        # Batches come from memory, in this process.
-        warnings.filterwarnings("ignore", ".*does not have many workers.*")
-        trainer.test(evaluation, loader, verbose=False)
+    trainer.test(evaluation, loader, verbose=False)
     result = {
         **evaluation.result(),
         "protocol": config.protocol,
@@ -59,7 +56,8 @@ def run(config: DictConfig) -> None:
     write_result(folder, result, evaluation.metrics, evaluation.table)
     pictures = save_pictures(folder / "pictures", evaluation, data.data(split))
     console = Console(width=150 if not Console().is_terminal else None, highlight=False)
-    title = f"{config.data.name}, {config.solver.name}, start={config.start.name}, {result['pairs']} pairs ({config.protocol})"
+    names = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
+    title = f"{names}, {result['pairs']} pairs ({config.protocol})"
     console.print(terminal_table(title, summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)

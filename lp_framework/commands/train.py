@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import shlex
-import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import (
     Callback,
@@ -22,12 +24,16 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lp_framework import registry
-from lp_framework.commands.building import build_data, plain, run_folder, versions
+from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
 from lp_framework.errors import UserError
-from lp_framework.evaluation.tables import write_json
+from lp_framework.evaluation.tables import write_csv, write_json
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, RECIPE, KeepRecipe, read_checkpoint
+from lp_framework.viz.pictures import save_training_picture
+
+METRICS = "metrics.csv"  # Lightning's name
 
 
+@orderly_console()
 def run(config: DictConfig) -> None:
     """Train into this run's folder, or go on in the folder that `resume` names."""
     folder = run_folder()
@@ -35,9 +41,10 @@ def run(config: DictConfig) -> None:
     if config.resume is not None:
         folder = Path(config.resume)
         last = folder / FOLDER / LAST
-        config = resumed_config(folder, config)
+        config = resumed_config(folder, config, HydraConfig.get().overrides.task)
     recipe = {"model": plain(config.model), "backbone": plain(config.backbone)}
-    if last is not None and read_checkpoint(last)[RECIPE] != recipe:
+    checkpoint = read_checkpoint(last) if last is not None else None
+    if checkpoint is not None and checkpoint[RECIPE] != recipe:
         raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
     seed_everything(config.seed, verbose=False)
     data = build_data(config)
@@ -54,25 +61,28 @@ def run(config: DictConfig) -> None:
     )
     if trainer.is_global_zero:
         OmegaConf.save(config, folder / "config.yaml")
-    with warnings.catch_warnings():
-        # Batches come from memory, in this process.
-        warnings.filterwarnings("ignore", ".*does not have many workers.*")
-        trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
+        if checkpoint is not None:
+            keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
+    trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
     if trainer.is_global_zero:
         report(trainer, folder, config, recipe)
 
 
-def resumed_config(folder: Path, config: DictConfig) -> DictConfig:
-    """The config of the run in `folder`; what else the command line says would be lost, so it must not differ."""
+def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """The config of the run in `folder`, with what the command line (`overrides`) says of the trainer.
+
+    A run may be prolonged or moved to other devices; all else stays as it was, and `UserError` is raised for it.
+    """
     saved = folder / "config.yaml"
     if not (folder / FOLDER / LAST).is_file() or not saved.is_file():
         raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
     previous = OmegaConf.load(saved)
     assert isinstance(previous, DictConfig)
-    # A run may be prolonged or moved to other devices; all else stays as it was.
-    previous.trainer = OmegaConf.merge(
-        previous.trainer, {"max_epochs": max(previous.trainer.max_epochs, config.trainer.max_epochs)}
-    )
+    keys = {override.partition("=")[0].strip("+~") for override in overrides} - {"resume", "plugins"}
+    for key in sorted(keys):
+        if key.partition(".")[0] != "trainer":
+            raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
+        OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
     return previous
 
 
@@ -84,21 +94,38 @@ def callbacks(config: DictConfig, folder: Path, recipe: dict[str, Any]) -> list[
         chosen.append(EMAWeightAveraging(decay=config.ema))
     if validated and config.patience is not None:
         chosen.append(EarlyStopping("val/loss", patience=config.patience))
-    best = {"monitor": "val/loss", "filename": Path(BEST).stem} if validated else {"filename": Path(BEST).stem}
     chosen.append(
         ModelCheckpoint(
-            folder / FOLDER, **best, save_last=True, enable_version_counter=False, save_on_train_epoch_end=True
+            folder / FOLDER,
+            monitor="val/loss" if validated else None,
+            filename=Path(BEST).stem,
+            save_last=True,
+            enable_version_counter=False,
+            save_on_train_epoch_end=True,
         )
     )
     return chosen
 
 
 def loggers(config: DictConfig, folder: Path) -> list[Logger]:
-    """CSV always, as `metrics.csv` in the run's folder; TensorBoard by config."""
+    """CSV always, as `METRICS` in the run's folder; TensorBoard by config."""
     chosen: list[Logger] = [CSVLogger(folder, name="", version="")]
     if config.logger.tensorboard:
         chosen.append(TensorBoardLogger(folder, name="tensorboard", version=""))
     return chosen
+
+
+def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
+    """Keep the rows of a run that goes on, up to its checkpoint's step: Lightning would begin the file anew."""
+    if not file.is_file():
+        return
+    with file.open(newline="") as content:
+        reader = csv.DictReader(content)
+        columns = list(reader.fieldnames or ())
+        rows = [list(row.values()) for row in reader if row["step"] and int(row["step"]) < steps]
+    writer = next(logger for logger in trainer.loggers if isinstance(logger, CSVLogger)).experiment
+    write_csv(file, columns, rows)
+    writer.metrics_keys = columns
 
 
 def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any]) -> None:
@@ -113,4 +140,6 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
     console = Console(soft_wrap=True, highlight=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
     console.print(f"model:   {folder / FOLDER / BEST}")
+    for picture in save_training_picture(folder):
+        console.print(f"picture: {picture}")
     console.print(f"next:    python -m lp_framework eval checkpoint={shlex.quote(str(folder))}")

@@ -12,15 +12,18 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from filelock import FileLock
 from numpy.typing import DTypeLike, NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
+from rich.console import Console
 from rich.progress import track
 
 from lp_framework.errors import UserError
 
+T = TypeVar("T")
 _CHUNK = 1 << 24  # bytes a checksum step
 
 
@@ -40,20 +43,27 @@ def cached_array(
 
 
 def _write(folder: Path, key: str, shape: Sequence[int], dtype: DTypeLike, fill: Callable[[NDArray], None]) -> None:
-    partial = folder / f"{key}.partial.npy"
+    partial, note = folder / f"{key}.partial.npy", folder / f"{key}.partial.json"
     try:
         array = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=tuple(shape))
+        _reserve(partial)
         fill(array)
         array.flush()
-        record = {"shape": list(shape), "dtype": np.dtype(dtype).str, "checksum": _checksum(array)}
+        note.write_text(json.dumps({"shape": list(shape), "dtype": np.dtype(dtype).str, "checksum": _checksum(array)}))
         del array
         (folder / f"{key}.json").unlink(missing_ok=True)
         os.replace(partial, folder / f"{key}.npy")
+        os.replace(note, folder / f"{key}.json")
     finally:
         partial.unlink(missing_ok=True)
-    note = folder / f"{key}.partial.json"
-    note.write_text(json.dumps(record))
-    os.replace(note, folder / f"{key}.json")
+        note.unlink(missing_ok=True)
+
+
+def _reserve(file: Path) -> None:
+    """Give a sparse file its disk space: where a mapped page finds the disk full, the process dies of a SIGBUS."""
+    if hasattr(os, "posix_fallocate"):  # not on macOS
+        with file.open("r+b") as opened:
+            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
 
 
 def _intact(folder: Path, key: str, shape: Sequence[int], dtype: DTypeLike) -> bool:
@@ -62,7 +72,7 @@ def _intact(folder: Path, key: str, shape: Sequence[int], dtype: DTypeLike) -> b
         array = np.load(folder / f"{key}.npy", mmap_mode="r")
         expected = list(shape) == record["shape"] == list(array.shape) and np.dtype(dtype) == array.dtype
         return bool(expected) and _checksum(array) == record["checksum"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except Exception:  # damaged files raise anything from EOFError to SyntaxError
         return False
 
 
@@ -70,15 +80,24 @@ def _checksum(array: NDArray) -> int:
     flat = array.reshape(-1).view(np.uint8)
     checksum = 0
     for start in range(0, len(flat), _CHUNK):
-        checksum = zlib.crc32(flat[start : start + _CHUNK], checksum)
+        checksum = zlib.crc32(flat[start : start + _CHUNK].data, checksum)
     return checksum
+
+
+def tracked(items: Sequence[T], description: str) -> Iterable[T]:
+    """The items, with a progress bar on the terminal while they last; nothing is printed elsewhere."""
+    console = Console(stderr=True)
+    return track(items, description, console=console, transient=True, disable=not console.is_terminal)
 
 
 def content_key(files: Iterable[Path], *facts: object) -> str:
     """A key for what is computed from the bytes of `files`, in their order, and from `facts`."""
     digest = hashlib.blake2b(repr(facts).encode(), digest_size=16)
     for file in files:
-        digest.update(hashlib.blake2b(file.read_bytes()).digest())
+        try:
+            digest.update(hashlib.blake2b(file.read_bytes()).digest())
+        except OSError as error:
+            raise UserError(f"{file}: cannot be read ({error.strerror})") from error
     return digest.hexdigest()
 
 
@@ -92,7 +111,7 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path) -> tuple
 
     def fill(array: NDArray) -> None:
         sizes: dict[Path, tuple[int, int]] = {}
-        for index, file in enumerate(track(files, description="decoding views", transient=True)):
+        for index, file in enumerate(tracked(files, "decoding views")):
             image = _decode(file)
             expected = sizes.setdefault(file.parent, image.size)
             if image.size != expected:
@@ -110,7 +129,7 @@ def _decode(file: Path) -> Image.Image:
     try:
         with Image.open(file) as image:
             rgba = image.convert("RGBA")
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(f"{file}: is not a readable image ({error})") from error
     if rgba.width != rgba.height:
         raise UserError(f"{file}: is {rgba.width} x {rgba.height} pixels; views must be square")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -10,12 +11,11 @@ import numpy as np
 import torch
 from lightning import LightningDataModule
 from numpy.typing import NDArray
-from rich.progress import track
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from lp_framework.data.cache import cached_array, content_key, decoded_views
-from lp_framework.data.pairs import BlockSampler, ListSampler, PairBatch, PairData, ViewTable, as_images
+from lp_framework.data.cache import cached_array, content_key, decoded_views, tracked
+from lp_framework.data.pairs import BlockSampler, ListSampler, PairBatch, PairData, Rows, ViewTable, as_images
 from lp_framework.data.views import ObjectViews, object_names, read_views
 from lp_framework.errors import UserError
 
@@ -57,6 +57,7 @@ class PairDataModule(LightningDataModule):
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
         self.validation_views, self.seed = validation_views, seed
         self._extractor: FeatureExtractor | None = None
+        self._folders: dict[str, list[ObjectViews]] = {}
         self._tables: dict[str, ViewTable] = {}
 
     # ------------------------------------------------------------ what there is
@@ -64,17 +65,26 @@ class PairDataModule(LightningDataModule):
     def prepare_data(self) -> None:
         """Make what is missing on disk, in one process: decoded views, cached features."""
         for split in ("train", "test"):
-            self._arrays(self.table(split))
+            self.data(split)
 
     def table(self, split: str) -> ViewTable:
         """All views of a split: "train" and "validation" (both from the training views on disk), or "test"."""
         if split not in self._tables:
-            folder = "test" if split == "test" else "train"
-            views = [read_views(self.path, name, folder) for name in object_names(self.path)]
+            views = self._on_disk(split)
             if split != "test" and self.validation_views:
                 views = [self._validation_split(each, held_out=split == "validation") for each in views]
             self._tables[split] = ViewTable(views)
         return self._tables[split]
+
+    def names(self) -> list[str]:
+        """The objects of this data set, sorted: all whose views are in `path`."""
+        return object_names(self.path)
+
+    def _on_disk(self, split: str) -> list[ObjectViews]:
+        folder = "test" if split == "test" else "train"
+        if folder not in self._folders:
+            self._folders[folder] = [read_views(self.path, name, folder) for name in self.names()]
+        return self._folders[folder]
 
     def _validation_split(self, views: ObjectViews, held_out: bool) -> ObjectViews:
         count = self.validation_views
@@ -92,8 +102,8 @@ class PairDataModule(LightningDataModule):
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
         self._extractor = extractor
 
-    def _arrays(self, table: ViewTable) -> tuple[NDArray, NDArray | None]:
-        key, images = decoded_views(table.files, self.image_size, self.cache)
+    def _arrays(self, files: Sequence[Path]) -> tuple[NDArray, NDArray | None]:
+        key, images = decoded_views(files, self.image_size, self.cache)
         if self._extractor is None:
             return images, None
         extractor = self._extractor
@@ -108,7 +118,14 @@ class PairDataModule(LightningDataModule):
     def data(self, split: str) -> PairData:
         """The batches of a split, addressed by pairs."""
         table = self.table(split)
-        return PairData(table, *self._arrays(table))
+        # Training and validation views share one array, so that another way to divide them decodes nothing anew.
+        files = [file for views in self._on_disk(split) for file in views.files]
+        images, features = self._arrays(files)
+        if files == table.files:
+            return PairData(table, images, features)
+        place = {file: row for row, file in enumerate(files)}
+        rows = np.array([place[file] for file in table.files])
+        return PairData(table, Rows(images, rows), None if features is None else Rows(features, rows))
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
@@ -137,5 +154,5 @@ class PairDataModule(LightningDataModule):
 
 @torch.inference_mode()
 def _extract(extractor: FeatureExtractor, images: NDArray, array: NDArray, batch: int = 32) -> None:
-    for start in track(range(0, len(images), batch), description="computing features", transient=True):
+    for start in tracked(range(0, len(images), batch), "computing features"):
         array[start : start + batch] = extractor.trunk(as_images(images[start : start + batch])).numpy()

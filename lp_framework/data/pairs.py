@@ -94,7 +94,7 @@ class ViewTable:
             if len(views) < 2:
                 raise UserError(f"object '{name}' has {len(views)} view here; a pair needs two")
             if protocol == "per_view":
-                random = np.random.default_rng([seed, index])
+                random = np.random.default_rng([seed, stable_id(name)])  # whatever else the table holds
                 others = [random.choice(views[views != query]) for query in views]
                 chosen.append(np.stack([np.array(others), views], axis=1))
                 continue
@@ -106,10 +106,26 @@ class ViewTable:
         return np.concatenate(chosen)
 
 
-class PairData(Dataset[PairBatch]):
-    """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves."""
+class Rows:
+    """Some rows of a memory-mapped array, numbered anew; read when they are asked for."""
 
-    def __init__(self, table: ViewTable, images: NDArray | None, features: NDArray | None) -> None:
+    def __init__(self, array: NDArray, rows: NDArray[np.int64]) -> None:
+        self.array, self.rows = array, rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int | slice | NDArray[np.int64]) -> NDArray:
+        return self.array[self.rows[index]]
+
+
+class PairData(Dataset[PairBatch]):
+    """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
+
+    `images` (uint8) and `features` have a row a view of the table.
+    """
+
+    def __init__(self, table: ViewTable, images: NDArray | Rows | None, features: NDArray | Rows | None) -> None:
         self.table, self.images, self.features = table, images, features
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
@@ -132,7 +148,7 @@ class PairData(Dataset[PairBatch]):
 
 def as_images(pixels: NDArray) -> Tensor:
     """Images `[I, 3, H, W]` in [-1, 1] from pixels `[I, H, W, 3]` (uint8)."""
-    return torch.from_numpy(np.ascontiguousarray(pixels)).permute(0, 3, 1, 2).float() / 127.5 - 1
+    return torch.tensor(pixels).permute(0, 3, 1, 2).float() / 127.5 - 1  # a copy: the cache is read-only
 
 
 class BlockSampler(Sampler[NDArray[np.int64]]):
@@ -141,11 +157,16 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
     The views of an object are shuffled and cut into blocks of B; a unit is two blocks with the 2 B^2 pairs across
     them (a block's own pairs ride along once); a batch is a few units, of any objects. So a view that went through
     the backbone once serves about B pairs of its batch. The order depends on (seed, epoch) alone.
+
+    Processes share the units out: each gets equally many batches, whose sizes differ by one unit at most. Units are
+    repeated only where there are fewer than batches.
     """
 
     def __init__(
         self, table: ViewTable, batch_pairs: int, block: int, seed: int, rank: int = 0, ranks: int = 1
     ) -> None:
+        if alone := [name for name, count in zip(table.names, table.counts, strict=True) if count < 2]:
+            raise UserError(f"object '{alone[0]}' has 1 view to train on; a pair needs two")
         self.table, self.block, self.seed = table, block, seed
         self.rank, self.ranks = rank, ranks
         self.units_per_batch = max(1, round(batch_pairs / (2 * block * block)))
@@ -167,10 +188,9 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
         random = np.random.default_rng([self.seed, self.epoch])
         units = [unit for index in range(len(self.table.names)) for unit in self._object_units(index, random)]
         order = random.permutation(len(units))
-        # Ranks take turns; all have the same number of batches, the last ones wrap around to the first.
-        for batch in range(len(self)):
-            first = (batch * self.ranks + self.rank) * self.units_per_batch
-            chosen = [order[place % len(order)] for place in range(first, first + self.units_per_batch)]
+        batches = len(self) * self.ranks
+        order = np.resize(order, max(len(order), batches))  # repeats from the start where there are too few
+        for chosen in np.array_split(order, batches)[self.rank :: self.ranks]:
             yield np.concatenate([units[unit] for unit in chosen])
 
     def _object_units(self, index: int, random: np.random.Generator) -> list[NDArray[np.int64]]:
@@ -199,7 +219,7 @@ def _within(views: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class ListSampler(Sampler[NDArray[np.int64]]):
-    """Given pairs `[P, 2]` in order, in batches of whole objects' runs, shared out over processes.
+    """Given pairs `[P, 2]` in order, in batches of `batch_pairs`, shared out over processes.
 
     Processes get equally many batches; where the number does not divide, the last ones repeat earlier batches, and
     the metrics count a pair once.

@@ -27,13 +27,17 @@ class RenderedData(PairDataModule):
         """The objects to render."""
         raise NotImplementedError
 
+    def names(self) -> list[str]:
+        """The objects of this data set alone, whatever else has been rendered into `path`."""
+        return sorted(obj.name for obj in self.objects())
+
     def prepare_data(self) -> None:
-        """Render what is missing, then as every data set."""
-        self.render()
+        """Render what is missing, then as every data set. Meshes whose views are there are not loaded."""
+        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers, check_meshes=False)
         super().prepare_data()
 
     def render(self) -> None:
-        """Render the objects that are not there yet."""
+        """Render the objects that are not there yet; the meshes of the others must be those they were made from."""
         render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers)
 
 
@@ -94,7 +98,7 @@ class MeshData(RenderedData):
         if not self.meshes.is_dir():
             raise UserError(f"{self.meshes}: there is no such folder of meshes; give data.path=FOLDER")
         formats = {f".{suffix}" for suffix in trimesh.available_formats()}
-        files = sorted(file for file in self.meshes.iterdir() if file.suffix.lower() in formats)
+        files = sorted(file for file in self.meshes.iterdir() if file.suffix.lower() in formats and file.name[0] != ".")
         if not files:
             raise UserError(f"{self.meshes}: holds no mesh file (known formats: {', '.join(sorted(formats))})")
         return [MeshObject(file.stem, "unlabelled", partial(load_scene, file)) for file in files]

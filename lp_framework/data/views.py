@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -73,50 +74,59 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
     """
     path = Path(root) / name / split / TRANSFORMS
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such file; every split of an object needs one") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: is not readable JSON ({error})") from error
     try:
         field_of_view = float(content["camera_angle_x"])
         frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{path}: needs camera_angle_x and frames with file_path and transform_matrix ({type(error).__name__}: "
             f"{error})"
         ) from error
     ambiguity = content.get("ambiguity", "unlabelled")
     if ambiguity not in AMBIGUITIES:
-        raise UserError(f"{path}: ambiguity '{ambiguity}' is none of {', '.join(AMBIGUITIES)}")
+        raise UserError(f"{path}: ambiguity {ambiguity!r} is none of {', '.join(AMBIGUITIES)}")
+    unique_answer = content.get("unique_answer")
+    if unique_answer is not None and not isinstance(unique_answer, bool):
+        raise UserError(f"{path}: unique_answer must be true, false or null, got {unique_answer!r}")
     if not frames:
         raise UserError(f"{path}: has no frames")
     if not 0 < field_of_view < math.pi:
         raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {field_of_view}")
     files = [_image_file(path, file_path) for file_path, _ in frames]
     cameras = torch.stack([_camera(path, index, matrix) for index, (_, matrix) in enumerate(frames)])
-    return ObjectViews(name, split, ambiguity, content.get("unique_answer"), files, cameras, field_of_view)
+    return ObjectViews(name, split, ambiguity, unique_answer, files, cameras, field_of_view)
 
 
 def _image_file(transforms: Path, file_path: str) -> Path:
     for folder in (transforms.parent / "rgb", transforms.parent):
-        if (folder / file_path).is_file():
+        if os.path.isfile(folder / file_path):  # unlike Path.is_file, False for an impossible name
             return folder / file_path
-    raise UserError(f"{transforms}: the image '{file_path}' is neither in rgb/ nor beside this file")
+    raise UserError(f"{transforms}: the image {file_path!r} is neither in rgb/ nor beside this file")
 
 
 def _camera(path: Path, index: int, matrix: Any) -> Tensor:
     try:
         camera = torch.tensor(matrix, dtype=torch.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         camera = torch.empty(0)
     if camera.shape != (4, 4) or not camera.isfinite().all():
         raise UserError(f"{path}: transform_matrix of frame {index} is not a 4 x 4 matrix of finite numbers")
-    rotation = camera[:3, :3]
-    if (rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3 or rotation.det() < 0:
+    rotation, identity = camera[:3, :3], torch.eye(4, dtype=torch.float64)
+    skew = (rotation.mT @ rotation - identity[:3, :3]).abs().max()
+    last_row = (camera[3] - identity[3]).abs().max()
+    # These comparisons refuse NaN as well, which huge numbers lead to.
+    if not (skew < 1e-3 and last_row < 1e-3 and rotation.det() > 0):
         raise UserError(f"{path}: transform_matrix of frame {index} is not a rigid camera-to-world transform")
+    distance = camera[:3, 3].norm().item()
+    if not 1e-6 < distance < math.inf:
+        raise UserError(f"{path}: the camera of frame {index} must stand off the origin; its distance is {distance:g}")
     residual = spherical_residual(camera).item()
-    if camera[:3, 3].norm() < 1e-6 or residual > LARGEST_RESIDUAL:
+    if not residual <= LARGEST_RESIDUAL:
         raise UserError(
             f"{path}: the camera of frame {index} does not look at the origin with +Y up (it is {residual:.1f} degrees "
             f"off, {LARGEST_RESIDUAL:g} are allowed)"

@@ -38,10 +38,22 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
             turned = degrees <= threshold
             metrics[f"{prefix}@{threshold}"] = (turned & (distance <= TRANSLATION_THRESHOLD)).double().mean().item()
             metrics[f"{prefix}(R)@{threshold}"] = turned.double().mean().item()
-    # quantile, because `median` takes the lower one of an even count.
-    metrics["rotation_error"] = rotation.gather(1, pick).double().quantile(0.5).item()
-    metrics["translation_error"] = translation.gather(1, pick).double().quantile(0.5).item()
+    metrics["rotation_error"] = median(rotation.gather(1, pick))
+    metrics["translation_error"] = median(translation.gather(1, pick))
     return metrics
+
+
+def median(values: Tensor) -> float:
+    """The median, of an even count the mean of the middle two; infinity is a value like others.
+
+    (torch's `median` takes the lower one of an even count, its `quantile` makes infinity NaN.)
+
+    >>> median(torch.tensor([3.0, 1.0, torch.inf, 2.0]))
+    2.5
+    """
+    ordered = values.flatten().double().sort().values
+    middle = len(ordered) // 2
+    return ordered[middle].item() if len(ordered) % 2 else ordered[middle - 1 : middle + 1].mean().item()
 
 
 class PoseMetrics(Metric):
@@ -66,6 +78,7 @@ class PoseMetrics(Metric):
         self.names, self.ambiguities, self.unique_answer = list(names), list(ambiguities), list(unique_answer)
         for state in STATES:
             self.add_state(state, [], dist_reduce_fx="cat")
+        self._all_rows: dict[str, Tensor] | None = None
 
     def update(
         self, pair: Tensor, object: Tensor, rotation: Tensor, translation: Tensor, chosen: Tensor, answer: Tensor
@@ -75,16 +88,25 @@ class PoseMetrics(Metric):
         """
         for state, value in zip(STATES, (pair, object, rotation, translation, chosen, answer), strict=True):
             getattr(self, state).append(value)
+        self._all_rows = None
+
+    def reset(self) -> None:
+        super().reset()
+        self._all_rows = None
 
     def rows(self) -> dict[str, Tensor]:
-        """One row a pair, by ascending pair number, each pair once."""
+        """One row a pair, by ascending pair number, each pair once; of all processes once `compute` has run."""
+        return self._gathered() if self._all_rows is None else self._all_rows
+
+    def _gathered(self) -> dict[str, Tensor]:
         rows = {state: dim_zero_cat(getattr(self, state)).cpu() for state in STATES}
         order = first_of_each(rows["pair"])
         return {state: value[order] for state, value in rows.items()}
 
     def compute(self) -> dict[str, Any]:
         """`metrics`, `metrics_unique_answer` (None where no object is labelled so), `per_object`, `per_ambiguity`."""
-        rows = self.rows()
+        # Here, and only here, torchmetrics has the states of all processes together.
+        self._all_rows = rows = self._gathered()
 
         def over(objects: Sequence[int]) -> dict[str, float] | None:
             mask = torch.isin(rows["object"], torch.tensor(list(objects)))

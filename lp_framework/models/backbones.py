@@ -66,6 +66,41 @@ class Backbone(nn.Module):
         return self
 
 
+class Standardise(nn.Module):
+    """Each feature to mean 0 and standard deviation 1 over all training data met so far.
+
+    Unlike batch normalisation it never uses the batch's own statistics: a batch here holds many views of few objects,
+    and what they share is what tells the objects apart.
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(dim))
+        self.register_buffer("variance", torch.zeros(dim))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """`[I, dim]` to `[I, dim]`; in training the statistics take the batch in first (Chan et al. 1983)."""
+        if self.training:
+            self._take_in(features.detach().float())
+        spread = self.variance.sqrt()
+        return (features - self.mean) / (spread + 0.05 * spread.mean() + 1e-6)
+
+    @torch.no_grad()
+    def _take_in(self, features: Tensor) -> None:
+        added = features.shape[0]
+        share = added / (self.count + added)
+        offset = features.mean(dim=0) - self.mean
+        variance = features.var(dim=0, unbiased=False)
+        self.variance += share * (variance - self.variance + (1 - share) * offset.square())
+        self.mean += share * offset
+        self.count += added
+
+
 def freeze(module: nn.Module) -> None:
     """Fix a module's weights."""
     module.eval().requires_grad_(False)
@@ -94,7 +129,7 @@ class EfficientNetLite0(Backbone):
         channels = network._blocks[stride_32 - 1]._project_conv.out_channels
         self.trunk_dim = channels * 16
         self.head = nn.Sequential(
-            nn.BatchNorm1d(self.trunk_dim, affine=False),
+            Standardise(self.trunk_dim),
             nn.Linear(self.trunk_dim, hidden),
             nn.LayerNorm(hidden),
             nn.ReLU(),
@@ -117,6 +152,9 @@ class ResNet(Backbone):
 
     The paper's backbone is `arch=resnet50`, trained with the rest: 2048 features an image.
     """
+
+    mean: Tensor
+    std: Tensor
 
     def __init__(
         self, arch: str = "resnet50", pretrained: bool = True, frozen: bool = False, image_size: int = 224
@@ -150,7 +188,7 @@ class ResNet(Backbone):
         except OSError as error:  # URLError among them
             warnings.warn(
                 f"the ImageNet weights of {arch} cannot be had ({error}); training starts from random weights. "
-                f"Put {weights.url.rpartition('/')[2]} into ~/.cache/torch/hub/checkpoints to use them.",
+                f"Put {weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints to use them.",
                 stacklevel=2,
             )
 

@@ -76,10 +76,15 @@ def load_model(path: str | Path) -> PoseModel:
     try:
         backbone = registry.build("backbone", recipe["backbone"])
         model = registry.build("model", recipe["model"], backbone=backbone)
+        model.on_load_checkpoint(checkpoint)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
-    model.on_load_checkpoint(checkpoint)
-    missing, unexpected = model.load_state_dict(checkpoint["state_dict"], strict=False)
+    try:
+        missing, unexpected = model.load_state_dict(checkpoint["state_dict"], strict=False)
+    except RuntimeError as error:  # of other shapes
+        raise UserError(
+            f"{file}: its weights are of another {recipe['model']['name']} model: {str(error).splitlines()[-1].strip()}"
+        ) from error
     if missing or unexpected:
         raise UserError(
             f"{file}: its weights are of another {recipe['model']['name']} model: missing {missing[:2]}, "

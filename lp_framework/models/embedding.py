@@ -13,6 +13,8 @@ class PoseEmbedding(nn.Module):
     paper's target on the line tells them apart, so there it is half a turn (and a quarter for room beyond the ends).
     """
 
+    frequencies: Tensor
+
     def __init__(self, frequencies: int = 4, periodic: bool = True) -> None:
         super().__init__()
         doubling = 2.0 ** torch.arange(frequencies)

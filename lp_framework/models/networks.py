@@ -11,13 +11,11 @@ from lp_framework.models.embedding import PoseEmbedding
 
 
 class ResidualLayer(nn.Module):
-    """x + W2 relu(W1 norm(x)), width unchanged."""
+    """x + relu(norm(W x)), width unchanged."""
 
     def __init__(self, width: int, dropout: float) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU(), nn.Dropout(dropout), nn.Linear(width, width)
-        )
+        self.layers = nn.Sequential(nn.Linear(width, width), nn.LayerNorm(width), nn.ReLU(), nn.Dropout(dropout))
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.layers(x)
@@ -39,7 +37,7 @@ class PoseNetwork(nn.Module):
         self.query = nn.Linear(feature_dim, hidden, bias=False)
         self.pose = nn.Linear(self.embedding.dim, hidden, bias=False)
         self.residual = nn.Sequential(*(ResidualLayer(hidden, dropout) for _ in range(layers)))
-        self.output = nn.Sequential(nn.LayerNorm(hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+        self.output = nn.Linear(hidden, outputs)
 
     def project(self, reference: Tensor, query: Tensor) -> Tensor:
         """The image part of the first layer: `[P, hidden]` for features `[P, feature_dim]` of each side."""

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from lightning import LightningModule
-from torch import Tensor, nn
+from torch import Tensor
 
 from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError
@@ -22,6 +22,7 @@ from lp_framework.models.view_head import ViewHead
 from lp_framework.registry import register
 
 VALIDATION_NOISES = 4  # noised poses a validation pair
+WEIGHTS = {"state_dict", "current_model_state"}  # where a checkpoint has weights; the second is of a moving average
 # Relative poses of views with latitudes in [-30, 30] degrees and radii in [1.2, 2.0].
 LOW, HIGH = (-math.pi / 3, 0.0, -0.8), (math.pi / 3, 2 * math.pi, 0.8)
 
@@ -116,7 +117,15 @@ class PoseModel(LightningModule):
         self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
 
     def _features(self, batch: PairBatch) -> Tensor:
-        return self.encode(batch.images) if batch.features is None else self.backbone.head(batch.features)
+        if batch.features is not None:
+            features: Tensor = self.backbone.head(batch.features)
+            return features
+        assert batch.images is not None  # a batch has one or the other
+        return self.encode(batch.images)
+
+    def on_train_epoch_start(self) -> None:
+        """Dropout draws from the global generator; a resumed run's draws are those of an uninterrupted one."""
+        torch.manual_seed((self.seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
 
     def _generator(self) -> torch.Generator:
         """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does."""
@@ -149,18 +158,31 @@ class PoseModel(LightningModule):
     # ------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A frozen trunk comes with its backbone; its weights are left out."""
-        for key in self._trunk_keys():
-            checkpoint["state_dict"].pop(key, None)
+        """A frozen trunk comes with its backbone: its fingerprint is kept, its weights are left out."""
+        if not self.backbone.frozen:
+            return
+        checkpoint["trunk"] = self.backbone.fingerprint()
+        trunk = set(self._trunk_keys())
+        for state in WEIGHTS & checkpoint.keys():
+            checkpoint[state] = {key: value for key, value in checkpoint[state].items() if key not in trunk}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Put the frozen trunk's weights back, so that the rest is still checked strictly."""
+        """Put the frozen trunk's weights back, so that the rest is still checked strictly.
+
+        Raises `UserError` when the trunk here is not the one that the rest was trained on.
+        """
+        if not self.backbone.frozen:
+            return
+        if checkpoint.get("trunk") != self.backbone.fingerprint():
+            raise UserError(
+                "the frozen part of its backbone has other weights here than when the model was trained; "
+                "the pretrained weights of that time are wanted"
+            )
         here = self.state_dict()
-        checkpoint["state_dict"].update({key: here[key] for key in self._trunk_keys()})
+        for state in WEIGHTS & checkpoint.keys():
+            checkpoint[state].update({key: here[key] for key in self._trunk_keys()})
 
     def _trunk_keys(self) -> list[str]:
-        if not self.backbone.frozen:
-            return []
         trunk = self.backbone.trunk_module()
         prefix = next(name for name, module in self.named_modules() if module is trunk)
         return [f"{prefix}.{key}" for key in trunk.state_dict()]

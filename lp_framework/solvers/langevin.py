@@ -91,4 +91,4 @@ class Langevin(Solver):
             return score.norm(dim=-1)
         offset = pose[:, :, None] - pose[:, None]
         offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
-        return offset.norm(dim=-1).median(dim=-1).values
+        return offset.norm(dim=-1).nanmedian(dim=-1).values  # a start that failed leaves the others theirs

@@ -1,2 +1,204 @@
-def save_pictures(folder, evaluation, data):
-    return []
+"""The pictures of a run: which there are, and what goes into them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from lp_framework.data.pairs import PairBatch, PairData
+from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.metrics import summarise
+from lp_framework.models.objectives import PoseKernel
+from lp_framework.models.pose_model import FieldValue, PoseModel
+from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.langevin import Langevin
+from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
+from lp_framework.viz.fields import ARROW_SPACING, DENSITY_SPACING, FieldMap, field_figure, field_on_grid
+from lp_framework.viz.style import save_figure
+from lp_framework.viz.training import LOSSES, read_curves, training_figure
+
+
+class Pick(NamedTuple):
+    """A pair worth a picture: its row, and why."""
+
+    row: int
+    reason: str
+
+
+class ExactModel(nn.Module):
+    """Stands in for a model in a solver: the kernel's own score around the truth `[3]`, the best there is to learn."""
+
+    def __init__(self, kernel: PoseKernel, truth: Tensor, outputs: int = 3) -> None:
+        super().__init__()
+        self.kernel, self.truth, self.outputs = kernel, truth, outputs
+
+    def encode(self, images: Tensor) -> Tensor:
+        """No features are needed: `[I, 1]`."""
+        return images.new_zeros(len(images), 1)
+
+    def condition(self, reference: Tensor, query: Tensor) -> Tensor:
+        """See `PoseModel`."""
+        return reference
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        """See `PoseModel`."""
+        truth = self.truth.to(pose)
+        energy = self.kernel.energy(pose, truth) if self.outputs == 1 else None
+        return FieldValue(self.kernel.score(pose, truth), energy)
+
+
+def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
+    """After `Trainer.test`: fields of some pairs (failures first), cumulative errors, and the objects, into `folder`.
+
+    Each as PNG and PDF; returns the PNG files. The errors shown are the evaluation's; the fields' pairs are solved
+    again to see their trajectories, with the same starts and draws.
+    """
+    evaluation.eval()
+    rows, table = evaluation.metrics.rows(), evaluation.table
+    rotation, translation = rows["rotation"].numpy(), rows["translation"].numpy()
+    chosen, objects = rows["chosen"].numpy(), rows["object"].numpy()
+    written = []
+    answer = rotation[np.arange(len(rotation)), chosen]
+    for number, pick in enumerate(pick_pairs(answer, objects, table.unique_answer)):
+        views = np.array([divmod(int(rows["pair"][pick.row]), len(table))])
+        index = int(objects[pick.row])
+        start = chosen[pick.row]
+        title = f"{table.names[index].replace('_', ' ')} ({table.ambiguities[index]})"
+        note = (
+            f"{pick.reason}: rotation error {rotation[pick.row, start]:.1f}°, "
+            f"translation error {translation[pick.row, start]:.2f}"
+        )
+        figure = field_figure(*pair_contents(evaluation, data[views]), title, note)
+        written += save_figure(figure, folder / f"field_{number}")
+    classes = [table.ambiguities[index] for index in objects]
+    written += save_figure(errors_figure(rotation, translation, chosen, classes), folder / "errors")
+    written += save_figure(objects_figure(object_cards(rows, data)), folder / "objects")
+    return [file for file in written if file.suffix == ".png"]
+
+
+def save_training_picture(folder: Path) -> list[Path]:
+    """`training.png` and `.pdf` in a training run's folder, from its `metrics.csv`; none where nothing was logged."""
+    metrics = folder / "metrics.csv"
+    curves = read_curves(metrics) if metrics.is_file() else {}
+    losses = {name: curves[name] for name in LOSSES if name in curves}
+    if not losses:
+        return []
+    rate = next((curve for name, curve in curves.items() if name.startswith("lr-")), None)
+    return save_figure(training_figure(losses, rate), folder / "training")[:1]
+
+
+def pick_pairs(errors: NDArray, objects: NDArray, unique_answer: Sequence[bool | None]) -> list[Pick]:
+    """Up to four pairs by their rotation errors `[P]` and object indices `[P]`, the largest error first.
+
+    The worst, the median and the best among objects with a unique answer (among all where none is labelled so), and
+    the median among those without one. Ties go to the earlier row.
+    """
+    failed = np.nan_to_num(errors, nan=np.inf)
+    order = np.argsort(failed, kind="stable")
+    unique = np.array([unique_answer[index] is True for index in objects])
+    judged = order[unique[order]] if unique.any() else order
+    among = f"of {len(judged)} pairs" + (" with a unique answer" if unique.any() else "")
+    worst = judged[np.searchsorted(failed[judged], failed[judged[-1]])]  # the first row of those that tie
+    wanted = [
+        Pick(int(worst), f"worst {among}"),
+        Pick(int(judged[(len(judged) - 1) // 2]), f"median {among}"),
+        Pick(int(judged[0]), f"best {among}"),
+    ]
+    ambiguous = np.array([unique_answer[index] is False for index in objects])
+    others = order[ambiguous[order]]
+    if len(others):
+        reason = f"median of {len(others)} pairs without a unique answer"
+        wanted.append(Pick(int(others[(len(others) - 1) // 2]), reason))
+    first = {pick.row: pick for pick in reversed(wanted)}
+    return sorted(first.values(), key=lambda pick: (-failed[pick.row], pick.row))
+
+
+def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, NDArray, NDArray, list[FieldMap]]:
+    """What `field_figure` draws of a batch of one pair: both images, the truth, and the maps.
+
+    A solver with a model has two maps, its field and the exact one; any other has one, without arrows.
+    """
+    assert batch.images is not None  # evaluation never caches features
+    device = evaluation.device
+    ids = evaluation.table.pair_ids(batch.pairs).to(device)
+    pairs = Pairs(batch.images.to(device), batch.reference.to(device), batch.query.to(device), ids)
+    starts = evaluation.starts.make(ids, evaluation.seed)
+    truth = batch.relative_poses()[0]
+    solver = recording(evaluation.solver)
+    solution = solver.solve(pairs, starts, evaluation.seed)
+    model = getattr(solver, "model", None)
+    if isinstance(model, PoseModel):
+        field = "score" if model.outputs == 3 else "probability exp(-E) and score"
+        maps = [with_field(way("", solution, starts), f"Learned {field}", model, pairs, truth)]
+        oracle = FieldMap("")
+        exact = ExactModel(model.kernel, truth, model.outputs)
+        if isinstance(solver, Langevin):
+            ideal = copy.copy(solver)
+            ideal.model = exact  # type: ignore[assignment]  # has all of a PoseModel that this solver asks for
+            oracle = way("", ideal.solve(pairs, starts, evaluation.seed), starts)
+        maps.append(with_field(oracle, f"Exact {field} (oracle)", exact, pairs, truth))
+    else:
+        maps = [way("Starts and answer", solution, starts)]
+    reference, query = (as_pixels(batch.images[side[0]]) for side in (batch.reference, batch.query))
+    return reference, query, truth.numpy(), maps
+
+
+def way(title: str, solution: Solution, starts: Tensor) -> FieldMap:
+    """A map of what a solver did with the first pair of `solution`: starts, trajectories if any, ends, answer."""
+    return FieldMap(
+        title,
+        starts=starts[0].cpu().numpy(),
+        paths=None if solution.trajectory is None else solution.trajectory[0].cpu().numpy(),
+        ends=solution.poses[0].detach().cpu().numpy(),
+        chosen=int(solution.chosen[0]),
+    )
+
+
+def with_field(content: FieldMap, title: str, model: PoseModel | ExactModel, pairs: Pairs, truth: Tensor) -> FieldMap:
+    """The map with the field of `model` for the first of `pairs`, at the radius of the true relative pose `[3]`."""
+    device = pairs.images.device
+    with torch.no_grad():
+        features = model.encode(pairs.images)
+        condition = model.condition(features[pairs.reference[:1]], features[pairs.query[:1]])[None]  # [1, 1, hidden]
+        arrows, density = (
+            field_on_grid(lambda pose: model.field(condition, pose.to(device)), float(truth[2]), spacing)
+            for spacing in (ARROW_SPACING, DENSITY_SPACING)
+        )
+    return replace(content, title=title, arrows=arrows, density=None if density.energy is None else density)
+
+
+def recording(solver: Solver) -> Solver:
+    """The solver, told to keep its trajectory if it has a setting of that name; a copy, so the given one stays."""
+    if not isinstance(getattr(solver, "trajectory", None), bool):
+        return solver
+    solver = copy.copy(solver)
+    vars(solver)["trajectory"] = True
+    return solver
+
+
+def object_cards(rows: dict[str, Tensor], data: PairData) -> list[ObjectCard]:
+    """A card for every object that has pairs among the `rows` of `PoseMetrics`, with its first view."""
+    table = data.table
+    assert data.images is not None  # evaluation never caches features
+    cards = []
+    for index in rows["object"].unique().tolist():
+        mask = rows["object"] == index
+        metrics = summarise(rows["rotation"][mask], rows["translation"][mask], rows["chosen"][mask])
+        image = np.asarray(data.images[table.views_of(index)[0]])
+        cards.append(
+            ObjectCard(table.names[index], table.ambiguities[index], image, metrics["R(R)@15"], metrics["SR(R)@30"])
+        )
+    return cards
+
+
+def as_pixels(image: Tensor) -> NDArray:
+    """Pixels `[H, W, 3]` in [0, 1] of an image `[3, H, W]` in [-1, 1]."""
+    return ((image.float() + 1) / 2).clamp(0, 1).permute(1, 2, 0).cpu().numpy()

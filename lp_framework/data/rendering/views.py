@@ -132,7 +132,7 @@ def render_object(
 ) -> bool:
     """Render an object into `<root>/<name>`, whole or not at all; False when it was there already.
 
-    `on_view` is called with the number of views that have become ready. Raises `UserError` when the object does not
+    `on_view` is called with the number of views that have been made. Raises `UserError` when the object does not
     load, when its folder holds something else than the same object under the same protocol, or when it cannot be
     written; nothing of the object is left then.
     """
@@ -142,15 +142,12 @@ def render_object(
     scene = obj.load()
     record = {
         "object": obj.name,
-        "ambiguity": obj.ambiguity,
-        "unique_answer": obj.unique_answer,
         "mesh": fingerprint(scene),
-        "protocol": asdict(protocol),
         "renderer": renderer.name,
+        **_demands(obj, protocol),
     }
     if folder.exists():
         _check_record(folder, record)
-        on_view(protocol.views_per_object())
         return False
     partial = folder.with_name(f".{obj.name}.partial")
     try:
@@ -179,6 +176,20 @@ def render_object(
         _remove(partial)
         raise
     return True
+
+
+def _is_rendered(obj: MeshObject, root: str | Path, protocol: ViewProtocol) -> bool:
+    """Whether `<root>/<name>` holds the object's views, by its record; the mesh is not looked at."""
+    try:
+        record = json.loads((Path(root) / obj.name / RECORD).read_text())
+        return all(record[key] == value for key, value in _demands(obj, protocol).items())
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _demands(obj: MeshObject, protocol: ViewProtocol) -> dict[str, Any]:
+    """What a record must say besides the mesh."""
+    return {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer, "protocol": asdict(protocol)}
 
 
 def _transforms(poses: torch.Tensor, field_of_view_degrees: float, obj: MeshObject) -> dict[str, Any]:
@@ -229,9 +240,12 @@ def render_objects(
     protocol: ViewProtocol,
     renderer: Renderer,
     workers: int | None = None,
+    check_meshes: bool = True,
 ) -> None:
     """Render objects into `<root>/<name>`, several at once, with a progress bar; finished ones are skipped.
 
+    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them; without it a
+    record of the same protocol and labels is believed.
     `workers` is the number of processes, by default one a CPU core; 1 renders in this process. Two runs into one
     folder take turns. A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
     """
@@ -239,15 +253,17 @@ def render_objects(
     names = [obj.name for obj in todo]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"several objects have the same name: {', '.join(twice)}")
+    if not check_meshes:
+        todo = [obj for obj in todo if not _is_rendered(obj, root, protocol)]
     if not todo:
         return
     try:
         Path(root).mkdir(parents=True, exist_ok=True)
-        lock = FileLock(Path(root) / ".render.lock")
-        lock.acquire()
+        lock = FileLock(Path(root) / ".render.lock").acquire()
     except OSError as error:
         raise UserError(f"{root}: cannot be written ({error.strerror}); choose another folder") from error
-    with lock, _progress(protocol.views_per_object() * len(todo)) as on_view:
+    missing = [obj for obj in todo if not (Path(root) / obj.name).exists()]
+    with lock, _progress(protocol.views_per_object() * len(missing)) as on_view:
         if workers is None:
             workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         if min(workers, len(todo)) > 1:
@@ -313,9 +329,9 @@ def _in_processes(
 
 @contextmanager
 def _progress(views: int) -> Iterator[Callable[[int], None]]:
-    """A progress bar over views; yields the function that advances it."""
+    """A progress bar over views, none where there are none; yields the function that advances it."""
     columns = TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TextColumn("views"), TimeRemainingColumn()
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns, console=Console(stderr=True), disable=not views) as progress:
         task = progress.add_task("views", total=views)
         yield lambda ready: progress.advance(task, ready)
 

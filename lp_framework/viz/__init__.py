@@ -1,0 +1,1 @@
+"""Pictures: every plotting function takes arrays and returns a matplotlib `Figure`."""

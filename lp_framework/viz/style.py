@@ -1,0 +1,109 @@
+"""One look for all figures: type, lines, colours, axes in degrees, and saving."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, ParamSpec
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator, StrMethodFormatter
+from numpy.typing import NDArray
+
+# Okabe and Ito's palette, which the common kinds of colour blindness keep apart.
+BLUE, ORANGE, PURPLE, GREEN, VERMILION = "#0072B2", "#E69F00", "#CC79A7", "#009E73", "#D55E00"
+INK, MUTED, FAINT = "#222222", "#6B6B6B", "#D4D4D4"
+
+CLASS_COLOURS = {"unique": BLUE, "twofold": ORANGE, "continuous": PURPLE, "unlabelled": MUTED}
+TRUTH, ANSWER, OTHERS = "#FFC20A", VERMILION, "#3A3A3A"
+MAGNITUDE = LinearSegmentedColormap.from_list("magnitude", ["#C9DDEC", "#7FB2D9", "#3F86BE", "#0B4A86", "#062B57"])
+DENSITY = LinearSegmentedColormap.from_list("density", ["#FFFFFF", "#E9E4DA", "#CFC4AE"])
+
+SETTINGS: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],  # matplotlib brings it, so figures are alike everywhere
+    "font.size": 8,
+    "axes.titlesize": 8.5,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8,
+    "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "text.color": INK,
+    "text.parse_math": False,  # names of objects may hold a dollar sign
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.5,
+    "pdf.fonttype": 42,  # text stays text
+    "savefig.facecolor": "white",
+}
+
+_Parameters = ParamSpec("_Parameters")
+
+
+def styled(draw: Callable[_Parameters, Figure]) -> Callable[_Parameters, Figure]:
+    """A plotting function whose figure has the common look, whatever the caller's settings are."""
+
+    @functools.wraps(draw)
+    def drawn(*arguments: _Parameters.args, **named: _Parameters.kwargs) -> Figure:
+        with matplotlib.rc_context(SETTINGS):
+            return draw(*arguments, **named)
+
+    return drawn
+
+
+def save_figure(figure: Figure, path: Path) -> list[Path]:
+    """Write `path`.png (200 dots an inch) and `path`.pdf (vectors), each whole or not at all; returns both."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files = []
+    for suffix in ("png", "pdf"):
+        file = path.with_name(f"{path.name}.{suffix}")
+        partial = path.with_name(f".{file.name}.partial")
+        # Without a date the same figure is the same file.
+        metadata = {"CreationDate": None} if suffix == "pdf" else None
+        try:
+            with matplotlib.rc_context(SETTINGS):
+                figure.savefig(partial, format=suffix, dpi=200, metadata=metadata)
+            os.replace(partial, file)
+        finally:
+            partial.unlink(missing_ok=True)
+        files.append(file)
+    return files
+
+
+def degrees(axes: Axes, which: Literal["x", "y"], step: float) -> None:
+    """Ticks every `step` degrees on an axis, labelled with a degree sign."""
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_locator(MultipleLocator(step))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}°"))
+
+
+def open_frame(axes: Axes) -> None:
+    """Only the left and bottom edge, and a faint grid."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color=FAINT, linewidth=0.4)
+
+
+def show_image(axes: Axes, image: NDArray, title: str) -> None:
+    """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame."""
+    axes.imshow(image, interpolation="antialiased")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(color=FAINT, linewidth=0.8)
+    if title:
+        axes.set_title(title, color=MUTED, pad=3)

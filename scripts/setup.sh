@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# Make .venv: this package, editable, with what its tests need, at the versions of constraints.txt. Quick when done.
+# PYTHON=python3.12 bash scripts/setup.sh chooses the interpreter.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+fail() { echo "setup: $1" >&2; exit 1; }
+new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; }
+
+stamp=".venv/installed"
+wanted="$(cat pyproject.toml constraints.txt | cksum)"
+if [ -f "$stamp" ] && [ "$(cat "$stamp")" = "$wanted" ] && .venv/bin/python -c '' 2>/dev/null; then
+    exit 0
+fi
+
+if [ -n "${PYTHON:-}" ]; then
+    new_enough "$PYTHON" || fail "$PYTHON is not Python 3.10 or newer"
+else
+    for candidate in python3 python3.13 python3.12 python3.11 python3.10; do
+        if new_enough "$candidate"; then PYTHON="$candidate"; break; fi
+    done
+    [ -n "${PYTHON:-}" ] || fail "no Python 3.10 or newer found; name one: PYTHON=/path/to/python bash scripts/setup.sh"
+fi
+
+if ! .venv/bin/python -c '' 2>/dev/null; then
+    echo "setup: making .venv with $("$PYTHON" --version)"
+    "$PYTHON" -m venv --clear .venv || fail "$PYTHON -m venv did not work (Debian and Ubuntu: apt install python3-venv)"
+fi
+echo "setup: installing the packages of constraints.txt (some minutes the first time)"
+.venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[dev]" \
+    || fail "the packages could not be installed"
+echo "$wanted" > "$stamp"
+echo "setup: done"

@@ -1,0 +1,12 @@
+#!/usr/bin/env bash
+# Everything a change is judged by, without a GPU. Arguments go to pytest: bash scripts/test.sh -k registry -n 0
+set -euo pipefail
+cd "$(dirname "$0")/.."
+bash scripts/setup.sh
+export PATH="$PWD/.venv/bin:$PATH"
+export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"  # two test processes, a thread each
+
+echo "test: format";  ruff format --check --quiet .
+echo "test: lint";    ruff check --quiet .
+echo "test: types";   mypy --no-error-summary
+echo "test: pytest";  pytest --quiet -n 2 --dist loadfile -m "not slow and not gpu" "$@"

@@ -1,0 +1,153 @@
+"""What several tests share: a clean registry, the command line in this process, plugins written on the spot."""
+
+from __future__ import annotations
+
+import copy
+import os
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from lp_framework import cli, registry, torchvision_ops
+
+torchvision_ops.install()
+ROOT = Path(__file__).parents[1]
+
+
+@dataclass
+class Finished:
+    """A command that has run: exit status and what it printed."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def error(self) -> str:
+        """Its one sentence."""
+        lines = self.err.splitlines()
+        assert len(lines) == 1 and lines[0].startswith("error: "), self.err
+        return lines[0].removeprefix("error: ")
+
+
+@pytest.fixture
+def clean_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test registers or discovers is forgotten after it."""
+    before = set(sys.modules)
+    monkeypatch.setattr(registry, "_state", copy.deepcopy(registry._state))
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    for name in set(sys.modules) - before:
+        if name.partition(".")[0].startswith("tmp_"):  # modules that tests write are named so
+            del sys.modules[name]
+
+
+@pytest.fixture
+def lp(
+    clean_registry: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Finished]:
+    """`lp("train", "model=score")` in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def run(*arguments: str) -> Finished:
+        monkeypatch.setattr(sys, "argv", ["lp", *arguments])
+        capsys.readouterr()
+        try:
+            status = cli.main()
+        except SystemExit as stop:  # Hydra's --help
+            status = int(stop.code or 0)
+        return Finished(status, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def lp_process(tmp_path: Path) -> Callable[..., Finished]:
+    """The same in a process of its own."""
+
+    def run(*arguments: str, cwd: Path = tmp_path) -> Finished:
+        environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+        environment["PYTHONPATH"] = str(ROOT)
+        command = [sys.executable, "-m", "lp_framework", *arguments]
+        done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120)
+        return Finished(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str, str], Path]:
+    """`write("folder/file", text)` under the test's folder."""
+
+    def write_file(path: str, text: str) -> Path:
+        file = tmp_path / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(textwrap.dedent(text))
+        return file
+
+    return write_file
+
+
+@pytest.fixture
+def walker(tmp_path: Path, write: Callable[[str, str], Path]) -> Path:
+    """A working folder whose `plugins/` has a solver and a model, and whose `configs/demo.yaml` chooses them."""
+    write(
+        "plugins/walker/tmp_walker.py",
+        '''
+        from __future__ import annotations
+
+        from typing import Literal
+
+        from lp_framework.registry import register
+
+
+        @register("solver", "walk")
+        class Walk:
+            """Walks downhill."""
+
+            def __init__(
+                self, model: object, gamma: float = 0.3, steps: int = 50, limit: float | None = None,
+                order: Literal["first", "second"] = "first", sizes: tuple[int, int] = (1, 2),
+            ) -> None:
+                self.model, self.gamma, self.steps, self.limit, self.sizes = model, gamma, steps, limit, sizes
+
+
+        @register("solver", "jump")
+        class Jump:
+            """Jumps."""
+
+            def __init__(self, height: float) -> None:
+                self.height = height
+
+
+        @register("model", "net")
+        class Net:
+            """A network."""
+
+            def __init__(self, width: int = 3) -> None:
+                self.width = width
+        ''',
+    )
+    write("plugins/walker/conf/solver/walk.yaml", "steps: 7\n")
+    write("plugins/walker/conf/solver/long_walk.yaml", "name: walk\nsteps: 700\n")
+    write(
+        "configs/demo.yaml",
+        """
+        defaults:
+          - base
+          - solver: walk
+          - model: net
+          - experiment: null
+          - _self_
+        seed: 0
+        """,
+    )
+    write("configs/experiment/hike.yaml", "# @package _global_\nsolver: {steps: 60}\n")
+    write("configs/experiment/broken.yaml", "# @package _global_\nsolver: {stepz: 60}\n")
+    return tmp_path

@@ -1,0 +1,315 @@
+"""The command line: overview, composition of configs, sweeps, and every mistake told in one sentence."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from lp_framework import cli
+from lp_framework.errors import UserError
+
+ROOT = Path(__file__).parents[1]
+DEMO = ("train", "-cd", "configs", "-cn", "demo")
+
+
+@pytest.fixture
+def jobs(walker, monkeypatch):
+    """What the command `train` was run with, `(config, argv)` a job; gamma above 1 is bad input, steps of 0 a bug."""
+    jobs = []
+
+    def run(config):
+        jobs.append((config, list(sys.argv)))
+        if config.solver.get("gamma", 0) > 1:
+            raise UserError(f"gamma is {config.solver.gamma}, it must not exceed 1")
+        if config.solver.get("steps") == 0:
+            raise ZeroDivisionError("a bug")
+
+    module = types.ModuleType("lp_framework.commands.train")
+    module.run = run
+    monkeypatch.setitem(sys.modules, "lp_framework.commands.train", module)
+    return jobs
+
+
+def config_of(finished):
+    assert finished.status == 0, finished.err
+    return OmegaConf.to_container(OmegaConf.create(finished.out))
+
+
+# ---------------------------------------------------------------- overview
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",)])
+def test_the_overview_names_every_command(lp, arguments):
+    finished = lp(*arguments)
+    assert finished.status == 0
+    for command, summary in cli.COMMANDS.items():
+        assert command in finished.out and summary in finished.out
+
+
+def test_the_version_is_printed(lp):
+    finished = lp("--version")
+    assert finished.status == 0 and finished.out.startswith("lp_framework ")
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("plugins",)])
+def test_overview_and_listing_import_nothing_heavy(arguments, tmp_path):
+    code = "import sys; from lp_framework.cli import main; main(); print(*sys.modules, file=sys.stderr)"
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    loaded = set(done.stderr.split())
+    assert done.returncode == 0 and "lp_framework.cli" in loaded
+    assert not loaded & {"torch", "lightning", "hydra", "numpy", "trimesh", "hydra_zen"}
+
+
+# ---------------------------------------------------------------- composition
+
+
+def test_a_config_is_a_name_and_the_defaults_of_the_constructor_overridden_by_yaml(lp, walker):
+    config = config_of(lp(*DEMO, "--cfg", "job"))
+    assert config["solver"] == {
+        **{"name": "walk", "gamma": 0.3, "steps": 7, "limit": None, "order": "first", "sizes": [1, 2]}
+    }
+    assert config["model"] == {"name": "net", "width": 3}
+
+
+def test_a_yaml_with_a_name_is_one_more_choice(lp, walker):
+    solver = config_of(lp(*DEMO, "solver=long_walk", "--cfg", "job"))["solver"]
+    assert (solver["name"], solver["steps"]) == ("walk", 700)
+
+
+def test_the_users_own_folder_wins_over_a_plugins(lp, walker, write):
+    write("configs/solver/walk.yaml", "steps: 8\n")
+    write("configs/solver/stroll.yaml", "name: walk\ngamma: 0.1\n")
+    assert config_of(lp(*DEMO, "--cfg", "job"))["solver"]["steps"] == 8
+    assert config_of(lp(*DEMO, "solver=stroll", "--cfg", "job"))["solver"]["gamma"] == 0.1
+
+
+def test_an_experiment_holds_differences(lp, walker):
+    assert config_of(lp(*DEMO, "experiment=hike", "--cfg", "job"))["solver"]["steps"] == 60
+    assert config_of(lp(*DEMO, "experiment=hike", "solver.steps=5", "--cfg", "job"))["solver"]["steps"] == 5
+
+
+def test_a_yaml_may_choose_a_member_of_another_group(lp, walker, write):
+    write("configs/solver/walk.yaml", "defaults: [{/model@_global_.second: net}]\nsteps: 9\n")
+    config = config_of(lp(*DEMO, "--cfg", "job"))
+    assert config["second"] == {"name": "net", "width": 3}
+    assert config["solver"]["steps"] == 9 and "defaults" not in config["solver"]
+
+
+def test_the_help_of_a_command_lists_choices_and_settings(lp, walker):
+    finished = lp(*DEMO, "--help")
+    assert finished.status == 0
+    assert "solver: " in finished.out and "jump, " in finished.out and "long_walk" in finished.out
+    assert "experiment: broken, hike" in finished.out
+    assert "gamma: 0.3" in finished.out and "--multirun" in finished.out
+
+
+@pytest.mark.parametrize("command", [command for command in cli.COMMANDS if command != "plugins"])
+def test_every_command_has_a_module_a_config_and_a_help(lp, command):
+    assert importlib.util.find_spec(f"lp_framework.commands.{command}") is not None
+    config_of(lp(command, "--cfg", "job"))
+    assert f"Usage: lp {command} " in lp(command, "--help").out
+
+
+# ---------------------------------------------------------------- running
+
+
+def test_a_run_keeps_its_config_and_log_in_its_folder(lp, jobs, walker):
+    finished = lp(*DEMO, "solver.gamma=1")
+    assert (finished.status, finished.out, finished.err) == (0, "", "")
+    (config, argv), = jobs  # fmt: skip
+    assert type(config.solver.gamma) is float
+    (folder,) = (walker / "runs" / "demo").iterdir()
+    assert OmegaConf.load(folder / ".hydra" / "config.yaml") == config
+    assert (folder / "train.log").exists()
+    assert argv == ["lp", "train", "--config-dir", "configs", "--config-name", "demo", "solver.gamma=1"]
+
+
+def test_a_saved_config_holds_names_and_numbers_only(lp, jobs, walker):
+    lp(*DEMO)
+    (folder,) = (walker / "runs" / "demo").iterdir()
+    text = (folder / ".hydra" / "config.yaml").read_text()
+    assert "_target_" not in text and "tmp_walker" not in text and "!!" not in text
+
+
+def test_bad_input_met_while_running_is_one_sentence_and_in_the_log(lp, jobs, walker):
+    finished = lp(*DEMO, "solver.gamma=2")
+    assert finished.status == 1 and finished.error == "gamma is 2.0, it must not exceed 1"
+    (folder,) = (walker / "runs" / "demo").iterdir()
+    assert "gamma is 2.0, it must not exceed 1" in (folder / "train.log").read_text()
+
+
+def test_a_bug_keeps_its_traceback(lp, jobs, walker):
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        lp(*DEMO, "solver.steps=0")
+    (folder,) = (walker / "runs" / "demo").iterdir()
+    assert "Traceback" in (folder / "train.log").read_text()
+
+
+def test_full_errors_on_request(lp, jobs, monkeypatch):
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(UserError, match="must not exceed"):
+        lp(*DEMO, "solver.gamma=2")
+
+
+def test_a_sweep_runs_every_combination_in_a_folder_each(lp, jobs, walker):
+    assert lp(*DEMO, "--multirun", "solver.gamma=0,0.5", "solver.steps=1,2").status == 0
+    assert [(config.solver.gamma, config.solver.steps) for config, _ in jobs] == [(0, 1), (0, 2), (0.5, 1), (0.5, 2)]
+    (sweep,) = (walker / "runs" / "multirun" / "demo").iterdir()
+    assert sorted(each.name for each in sweep.iterdir() if each.is_dir()) == ["0", "1", "2", "3"]
+    assert jobs[1][1][-2:] == ["solver.gamma=0", "solver.steps=2"]  # a job's own command line, not the sweep's
+
+
+@pytest.mark.parametrize(("bad", "status"), [("solver.gamma=0,2,1", 1), ("solver.steps=1,0,2", None)])
+def test_a_job_that_fails_does_not_stop_a_sweep(lp, jobs, bad, status):
+    if status is None:
+        with pytest.raises(ZeroDivisionError):
+            lp(*DEMO, "--multirun", bad)
+    else:
+        finished = lp(*DEMO, "--multirun", bad)
+        assert finished.status == status
+        assert "job 1 (solver.gamma=2): gamma is 2.0" in finished.err and "Traceback" not in finished.err
+    assert len(jobs) == 3
+
+
+def test_a_job_of_a_sweep_does_not_see_the_ranks_of_the_one_before(lp, jobs, monkeypatch):
+    seen = []
+
+    def run(config):
+        seen.append(os.environ.get("LOCAL_RANK"))
+        os.environ["LOCAL_RANK"] = "1"  # as Lightning does when it starts several processes
+
+    monkeypatch.setattr(sys.modules["lp_framework.commands.train"], "run", run)
+    assert lp(*DEMO, "--multirun", "seed=1,2").status == 0
+    assert seen == [None, None]
+
+
+def test_jobs_of_a_sweep_in_worker_processes_know_the_plugins(lp_process, walker, write):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    write("elsewhere/tmp_worker.py", WORKER)
+    arguments = (
+        "plugins=[elsewhere]",
+        "+start=spot",
+        "start.x=1,2,3",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+    )
+    finished = lp_process(*DEMO, "--multirun", *arguments)
+    assert finished.status == 1, finished.err
+    assert "job 1 (plugins=[elsewhere], +start=spot, start.x=2): two is bad" in finished.err
+    assert "Traceback" not in finished.err
+    (sweep,) = (walker / "runs" / "multirun" / "demo").iterdir()
+    assert [(sweep / number / "x").read_text() for number in "02"] == ["1", "3"]
+
+
+WORKER = """
+    import sys, types
+    from pathlib import Path
+
+    from hydra.core.hydra_config import HydraConfig
+
+    from lp_framework.errors import UserError
+    from lp_framework.registry import build, register
+
+    @register("start", "spot")
+    class Spot:
+        def __init__(self, x: int = 0) -> None:
+            if x == 2:
+                raise UserError("two is bad")
+            self.x = x
+
+    def run(config):
+        (Path(HydraConfig.get().runtime.output_dir) / "x").write_text(str(build("start", config.start).x))
+
+    sys.modules["lp_framework.commands.train"] = types.ModuleType("stand-in")  # for a command that needs no data
+    sys.modules["lp_framework.commands.train"].run = run
+"""
+
+
+# ---------------------------------------------------------------- mistakes
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("trian",), "there is no command 'trian'; did you mean 'train'? (known: train, eval, "),
+        (("train", "experiment=papre"), "there is no experiment 'papre'; did you mean 'paper'? (known: "),
+        (("train", "trainer.max_epoch=3"), "trainer has no 'max_epoch'; did you mean 'trainer.max_epochs'? (known: "),
+        (("train", "model=scor"), "model=scor: there is no model 'scor'; did you mean 'score'? (known: "),
+        (("eval", "solver.gama=0"), "solver.gama: solver has no 'gama'; did you mean 'solver.gamma'? (known: name, "),
+        (("eval", "start=rnig"), "start=rnig: there is no start 'rnig'; did you mean 'ring'? (known: "),
+        ((*DEMO, "solver=wlak"), "solver=wlak: there is no solver 'wlak'; did you mean 'walk'? (known: "),
+        ((*DEMO, "experiment=hiek"), "there is no experiment 'hiek'; did you mean 'hike'? (known: "),
+        ((*DEMO, "slver=walk"), "slver: the configuration has no 'slver'; did you mean 'solver'?"),
+        ((*DEMO, "experimnt=hike"), "experimnt: the configuration has no 'experimnt'; did you mean 'experiment'?"),
+        (
+            (*DEMO, "solver.gama=1"),
+            "solver.gama: solver has no 'gama'; did you mean 'solver.gamma'? (known: name, gamma",
+        ),
+        ((*DEMO, "gamma=1"), "gamma: the configuration has no 'gamma'; did you mean 'solver.gamma'?"),
+        ((*DEMO, "sed=1"), "sed: the configuration has no 'sed'; did you mean 'seed'?"),
+        ((*DEMO, "solver.gamma=high"), "solver.gamma: Value 'high' of type 'str' could not be converted to Float"),
+        ((*DEMO, "solver.limit=low"), "solver.limit: Value 'low' of type 'str' could not be converted to Float"),
+        ((*DEMO, "solver.steps=1.5"), "solver.steps: Value '1.5' of type 'float' could not be converted to Integer"),
+        ((*DEMO, "experiment=broken"), "In 'experiment/broken': solver.stepz: solver has no 'stepz'; did you mean 's"),
+        ((*DEMO, "solver=walk,jump"), "'solver=walk,jump' has several values: add --multirun to run each"),
+        ((*DEMO, "seed=1,2"), "'seed=1,2' has several values: add --multirun to run each, or write a list, seed=[1,2]"),
+        ((*DEMO, "solver.gamma=[1"), "cannot read 'solver.gamma=[1': "),
+        ((*DEMO, "walk"), "cannot read 'walk': write KEY=VALUE"),
+        ((*DEMO, "model=3"), "Config group override must be a string or a list. Got int"),
+        ((*DEMO, "hydra.run.dir=${nowhere}"), "Interpolation key 'nowhere' not found"),
+        ((*DEMO, "--cfg", "job", "--multirun"), "Only one of --run, --multirun, --cfg, "),
+        ((*DEMO, "--mutirun"), "there is no option '--mutirun'; did you mean '--multirun'?"),
+        (("train", "-cd", "nowhere"), "Additional config directory '"),
+    ],
+)
+def test_a_command_line_that_makes_no_sense(lp, jobs, arguments, sentence):
+    finished = lp(*arguments)
+    assert finished.status == 2
+    assert finished.error.startswith(sentence) or sentence in finished.error
+    assert not jobs
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("stepz: 3\n", "walk.yaml: solver 'walk' has no 'stepz'; did you mean 'steps'? (known: name, gamma, "),
+        ("steps: many\n", "walk.yaml: Value 'many' of type 'str' could not be converted to Integer"),
+        ("steps: [1\n", "walk.yaml: not valid YAML: "),
+        ("- steps\n", "walk.yaml: a configuration is a mapping 'key: value', not a list"),
+        ("name: wlk\n", "walk.yaml: 'wlk' is no solver; did you mean 'walk'? (known: "),
+    ],
+)
+def test_a_file_with_a_mistake_is_named(lp, jobs, write, text, sentence):
+    write("configs/solver/walk.yaml", text)
+    finished = lp(*DEMO)
+    assert finished.status == 1 and sentence in finished.error
+
+
+def test_a_file_of_no_registered_name_must_say_of_what_it_is_a_preset(lp, jobs, write):
+    write("configs/solver/mine.yaml", "steps: 3\n")
+    finished = lp(*DEMO, "solver=mine")
+    assert finished.status == 1
+    assert "mine.yaml: 'mine' is no solver" in finished.error and "a preset" in finished.error
+
+
+def test_a_setting_without_a_default_has_to_be_given(lp, jobs, walker, monkeypatch):
+    def run(config):
+        return config.solver.height
+
+    monkeypatch.setattr(sys.modules["lp_framework.commands.train"], "run", run)
+    finished = lp(*DEMO, "solver=jump")
+    assert finished.status == 1 and finished.error == "solver.height needs a value: give solver.height=VALUE"
+    assert lp(*DEMO, "solver=jump", "solver.height=2").status == 0
+
+
+def test_a_mistake_in_a_process_of_its_own_leaves_no_traceback(lp_process, walker):
+    finished = lp_process(*DEMO, "solver.gama=1")
+    assert finished.status == 2 and "did you mean 'solver.gamma'" in finished.error

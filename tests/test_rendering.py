@@ -1,0 +1,538 @@
+import errno
+import json
+import math
+import os
+import warnings
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from filelock import FileLock
+from PIL import Image
+
+from lp_framework.data.meshes import MeshObject, load_scene, normalise
+from lp_framework.data.rendering import auto, pyrender_renderer
+from lp_framework.data.rendering.auto import AutoRenderer
+from lp_framework.data.rendering.pyrender_renderer import PyrenderRenderer, offscreen_context
+from lp_framework.data.rendering.raycast import RaycastRenderer
+from lp_framework.data.rendering.renderer import Renderer, downsample
+from lp_framework.data.rendering.views import ViewProtocol, render_object, render_objects
+from lp_framework.errors import UserError
+from lp_framework.geometry import camera_to_world, to_ifusion, view_pose
+
+HOUSEHOLD = Path(__file__).parents[1].parent / "shared" / "meshes" / "household"
+FIELD_OF_VIEW = 49.1  # degrees
+
+
+def open_gl() -> None:
+    try:
+        offscreen_context()
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(params=[PyrenderRenderer, RaycastRenderer], ids=lambda cls: cls.name)
+def renderer(request) -> Renderer:
+    if request.param is PyrenderRenderer:
+        open_gl()
+    return request.param()
+
+
+def cameras(*poses_degrees: tuple[float, float, float]) -> torch.Tensor:
+    """Camera matrices of (latitude, longitude, radius), in degrees."""
+    poses = torch.tensor(poses_degrees, dtype=torch.float64)
+    return camera_to_world(torch.cat([torch.deg2rad(poses[:, :2]), poses[:, 2:]], dim=1))
+
+
+def ball(centre: tuple[float, float, float], radius: float, colour: tuple[int, int, int]) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    mesh.apply_translation(centre)
+    mesh.visual.vertex_colors = [*colour, 255]
+    return mesh
+
+
+def textured_box() -> trimesh.Trimesh:
+    """A box with a smooth, colourful texture whose sides are no powers of two, the whole image on each face."""
+    box = trimesh.creation.box(extents=(1.0, 0.7, 0.5))
+    box.unmerge_vertices()
+    y, x = np.mgrid[0:150, 0:200] / 200
+    image = np.stack([x, y, 0.5 + 0.5 * np.sin(20 * x) * np.cos(15 * y)], axis=-1)
+    normals = np.abs(np.repeat(box.face_normals, 3, axis=0))
+    axes = np.argsort(normals, axis=1)[:, :2]  # the two directions along the face
+    uv = np.take_along_axis(box.vertices, axes, axis=1) + 0.5
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray((255 * image).astype(np.uint8)))
+    return box
+
+
+def vertex_coloured_torus() -> trimesh.Trimesh:
+    torus = trimesh.creation.torus(0.35, 0.15)
+    torus.visual.vertex_colors = np.c_[(torus.vertices * 255 + 128).clip(0, 255), np.full(len(torus.vertices), 255)]
+    return torus
+
+
+# ---------------------------------------------------------------- geometry of the image
+
+
+@pytest.mark.parametrize("pose", [(0, 0, 1.5), (20, 40, 1.3), (-30, 100, 2.0), (10, 200, 1.7), (-7.5, 345, 1.2)])
+def test_known_points_appear_where_a_pinhole_camera_sees_them(renderer, pose):
+    points = {(255, 0, 0): (0.4, 0.1, 0.0), (0, 255, 0): (-0.05, 0.45, 0.1), (0, 0, 255): (0.1, -0.3, 0.35)}
+    resolution = 128
+    focal = resolution / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
+    (matrix,) = cameras(pose).numpy()
+    for colour, point in points.items():
+        scene = trimesh.Scene([ball(point, 0.04, colour)])
+        (image,) = renderer.render(scene, matrix[None], resolution, FIELD_OF_VIEW)
+        x, y, z = matrix[:3, :3].T @ (np.array(point) - matrix[:3, 3])
+        expected = resolution / 2 + focal * x / -z, resolution / 2 - focal * y / -z
+        weight = image[..., 3] / 255.0
+        rows, columns = np.mgrid[0:resolution, 0:resolution] + 0.5
+        found = (columns * weight).sum() / weight.sum(), (rows * weight).sum() / weight.sum()
+        assert np.abs(np.subtract(found, expected)).max() < 0.25, (colour, found, expected)
+        assert image[image[..., 3] == 255][:, :3].argmax(axis=1).tolist().count(colour.index(255)) > 10
+
+
+RED, GREEN, BLUE, YELLOW, WHITE, BLACK = (
+    (230, 20, 20), (20, 230, 20), (20, 20, 230), (230, 230, 20), (230, 230, 230), (5, 5, 5),
+)  # fmt: skip
+
+
+def painted_box() -> trimesh.Trimesh:
+    """A cube: +X red, -X green, +Z blue, -Z yellow, +Y white, -Y black."""
+    box = trimesh.creation.box()
+    paint = {
+        (1, 0, 0): RED,
+        (-1, 0, 0): GREEN,
+        (0, 0, 1): BLUE,
+        (0, 0, -1): YELLOW,
+        (0, 1, 0): WHITE,
+        (0, -1, 0): BLACK,
+    }
+    box.visual.face_colors = [[*paint[tuple(normal.round().astype(int))], 255] for normal in box.face_normals]
+    return box
+
+
+def nearest_paint(pixel: np.ndarray) -> tuple[int, int, int]:
+    assert pixel[3] == 255
+    hue = pixel[:3] / max(pixel[:3].max(), 60)  # shading changes the brightness
+    paints = [RED, GREEN, BLUE, YELLOW, WHITE, BLACK]
+    return min(paints, key=lambda paint: np.abs(hue - np.array(paint) / max(*paint, 60)).sum())
+
+
+def test_each_side_is_seen_from_its_side_and_up_is_up_and_right_is_right(renderer):
+    views = cameras((0, 0, 3), (0, 90, 3), (0, 180, 3), (0, 270, 3), (40, 45, 3), (-40, 45, 3))
+    images = renderer.render(trimesh.Scene(painted_box()), views, 64, FIELD_OF_VIEW)
+    assert images.shape == (6, 64, 64, 4) and images.dtype == np.uint8
+    assert [nearest_paint(image[32, 32]) for image in images[:4]] == [BLUE, RED, YELLOW, GREEN]
+    from_above, from_below = images[4:]
+    assert nearest_paint(from_above[22, 32]) == WHITE and nearest_paint(from_below[42, 32]) == BLACK
+    # From between +Z and +X the side facing +Z lies to the left, the one facing +X to the right.
+    for image, row in ((from_above, 40), (from_below, 24)):
+        assert nearest_paint(image[row, 26]) == BLUE and nearest_paint(image[row, 38]) == RED
+
+
+def test_field_of_view_spans_the_image(renderer):
+    half = math.tan(math.radians(FIELD_OF_VIEW) / 2)  # half the width seen at distance 1
+    for scale, filled in ((1.01, True), (0.97, False)):
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half * scale
+        square = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
+        (image,) = renderer.render(trimesh.Scene(square), cameras((0, 0, 1)), 64, FIELD_OF_VIEW)
+        alpha = image[..., 3]
+        assert (alpha == 255).all() == filled
+        assert (alpha[1:-1, 1:-1] == 255).all() and (alpha == alpha[::-1]).all() and (alpha == alpha[:, ::-1]).all()
+
+
+# ---------------------------------------------------------------- look
+
+
+def test_edges_are_soft_and_have_the_colour_of_the_object(renderer):
+    square = trimesh.creation.box(extents=(1, 1, 1e-3))
+    square.visual.face_colors = [200, 40, 40, 255]
+    square.apply_transform(trimesh.transformations.rotation_matrix(0.3, [0, 0, 1]))
+    (image,) = renderer.render(trimesh.Scene(square), cameras((0, 0, 1.8)), 64, FIELD_OF_VIEW)
+    alpha = image[..., 3]
+    assert len(np.unique(alpha)) > 3
+    assert (image[alpha == 0] == 0).all()
+    edge, inside = image[(alpha > 0) & (alpha < 255)][:, :3], image[alpha == 255][:, :3]
+    assert np.abs(edge.astype(int) - inside.mean(axis=0)).max() < 25  # the background would pull it down by 100
+
+
+def test_light_turns_with_the_camera(renderer):
+    """All views of a body of revolution are equal: shading must not tell the longitude."""
+    vase = trimesh.creation.revolve([[0, -0.5], [0.3, -0.5], [0.2, 0.0], [0.35, 0.5], [0, 0.5]], sections=24)
+    vase.apply_transform(trimesh.transformations.rotation_matrix(-math.pi / 2, [1, 0, 0]))
+    images = renderer.render(
+        trimesh.Scene(vase), cameras((20, 0, 1.5), (20, 90, 1.5), (20, 195, 1.5)), 64, FIELD_OF_VIEW
+    )
+    difference = np.abs(images.astype(int) - images[0])
+    assert np.percentile(difference, 99) <= 1 and difference.mean() < 0.2
+    assert images[0][..., :3][images[0][..., 3] == 255].std() > 10  # while there is shading
+
+
+def test_inside_out_meshes_look_the_same(renderer):
+    mesh = vertex_coloured_torus()
+    inside_out = mesh.copy()
+    inside_out.invert()
+    view = cameras((25, 70, 1.4))
+    first, second = (renderer.render(trimesh.Scene(each), view, 48, FIELD_OF_VIEW)[0] for each in (mesh, inside_out))
+    assert np.abs(first.astype(int) - second).mean() < 0.1
+
+
+def test_a_sheet_painted_on_both_sides_shows_the_side_in_view(renderer):
+    corners = np.array([[-0.4, -0.4, 0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])
+    front, back = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]]), trimesh.Trimesh(corners, [[0, 2, 1], [0, 3, 2]])
+    front.visual.face_colors, back.visual.face_colors = [*RED, 255], [*GREEN, 255]
+    images = renderer.render(trimesh.Scene([front, back]), cameras((0, 0, 1.5), (0, 180, 1.5)), 32, FIELD_OF_VIEW)
+    for image, paint in zip(images, (RED, GREEN), strict=True):
+        assert {nearest_paint(pixel) for pixel in image[image[..., 3] == 255]} == {paint}
+
+
+def test_white_is_bright_without_being_blown_out_and_black_is_not_flat(renderer):
+    white, black = trimesh.creation.icosphere(radius=0.5), trimesh.creation.icosphere(radius=0.5)
+    for mesh, reflectance in ((white, 255), (black, 3)):
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=[reflectance] * 3 + [255])
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+    for mesh, low, high in ((white, 120, 254), (black, 5, 70)):
+        (image,) = renderer.render(trimesh.Scene(mesh), cameras((10, 0, 1.6)), 64, FIELD_OF_VIEW)
+        levels = image[..., :3][image[..., 3] == 255]
+        assert low <= levels.min() and levels.max() <= high and np.ptp(levels) >= 10
+
+
+def test_textures_are_upright_and_repeat(renderer):
+    """A square with texture coordinates from 0 to 2 shows the image four times, its first row on top."""
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[:4, :4], image[:4, 4:], image[4:, :4], image[4:, 4:] = RED, GREEN, BLUE, YELLOW
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    square = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    uv = 2.0 * (corners[:, :2] + 0.5)
+    square.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(image))
+    distance = 0.5 / math.tan(math.radians(FIELD_OF_VIEW) / 2)  # the square fills the image
+    (view,) = renderer.render(trimesh.Scene(square), cameras((0, 0, distance)), 64, FIELD_OF_VIEW)
+    centres = [[nearest_paint(view[row, column]) for column in (8, 24, 40, 56)] for row in (8, 24, 40, 56)]
+    assert centres == [[RED, GREEN] * 2, [BLUE, YELLOW] * 2] * 2
+
+
+def test_downsampling_takes_the_mean_with_premultiplied_alpha():
+    samples = np.zeros((2, 4, 4), np.uint8)
+    samples[0, 0], samples[1, 1] = (200, 100, 0, 255), (100, 100, 40, 255)
+    np.testing.assert_array_equal(downsample(samples), [[[150, 100, 20, 128], [0, 0, 0, 0]]])
+
+
+# ---------------------------------------------------------------- agreement of the renderers
+
+SCENES = {
+    "textured": lambda: trimesh.Scene(textured_box()),
+    "vertex_coloured": lambda: trimesh.Scene(vertex_coloured_torus()),
+    "face_coloured": lambda: trimesh.Scene(painted_box()),
+    "scanned_mug": lambda: load_scene(HOUSEHOLD / "red_coffee_mug.glb"),
+    "painted_sheets": lambda: load_scene(HOUSEHOLD / "wine_bottle.glb"),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_renderers_agree_on_silhouette_and_colour(name):
+    open_gl()
+    if name in ("scanned_mug", "painted_sheets") and not HOUSEHOLD.is_dir():
+        pytest.skip("the household meshes are not beside this checkout")
+    scene = normalise(SCENES[name]())
+    views = cameras((20, 30, 1.5), (-25, 160, 1.9))
+    by_gl, by_rays = (each.render(scene, views, 96, FIELD_OF_VIEW) for each in (PyrenderRenderer(), RaycastRenderer()))
+    inside_gl, inside_rays = by_gl[..., 3] >= 128, by_rays[..., 3] >= 128
+    overlap = (inside_gl & inside_rays).sum(axis=(1, 2)) / (inside_gl | inside_rays).sum(axis=(1, 2))
+    assert (overlap > 0.98).all()
+    both = (by_gl[..., 3] == 255) & (by_rays[..., 3] == 255)
+    difference = np.abs(by_gl[..., :3].astype(int) - by_rays[..., :3])[both]
+    assert difference.mean() < 2  # of 255
+
+
+# ---------------------------------------------------------------- machines without OpenGL
+
+
+def test_auto_takes_pyrender_where_there_is_opengl():
+    open_gl()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert AutoRenderer().name == "pyrender"
+
+
+def test_auto_takes_raycast_and_says_why(monkeypatch):
+    def no_opengl() -> None:
+        raise UserError("there is no OpenGL")
+
+    monkeypatch.setattr(auto, "offscreen_context", no_opengl)
+    with pytest.warns(UserWarning, match="raycast instead of pyrender: there is no OpenGL"):
+        chosen = AutoRenderer()
+    assert chosen.name == "raycast"
+    (image,) = chosen.render(trimesh.Scene(painted_box()), cameras((0, 90, 3)), 16, FIELD_OF_VIEW)
+    assert nearest_paint(image[8, 8]) == RED
+
+
+def test_pyrender_names_every_platform_that_failed(monkeypatch):
+    def fail() -> None:
+        raise OSError(f"no {os.environ['PYOPENGL_PLATFORM']} here")
+
+    monkeypatch.setattr(pyrender_renderer, "_open_context", fail)
+    monkeypatch.setattr(pyrender_renderer, "_forget_opengl", lambda: None)
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
+    with pytest.raises(UserError, match=r"no egl here.*no osmesa here.*renderer=raycast"):
+        offscreen_context.__wrapped__()
+    assert "PYOPENGL_PLATFORM" not in os.environ
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "osmesa")
+    with pytest.raises(UserError, match=r"\(osmesa: OSError: no osmesa here\)"):
+        offscreen_context.__wrapped__()
+
+
+# ---------------------------------------------------------------- the protocol
+
+
+def test_default_protocol_is_the_papers():
+    poses = ViewProtocol().training_poses("cup")
+    assert poses.shape == (216, 3) and poses.dtype == np.float64
+    np.testing.assert_allclose(np.unique(poses[:, 0].round(9)), np.radians(np.arange(-30, 31, 7.5)), atol=1e-8)
+    np.testing.assert_allclose(np.unique(poses[:, 1].round(9)), np.radians(np.arange(0, 360, 15)), atol=1e-8)
+    assert len(np.unique(poses[:, :2].round(9), axis=0)) == 216
+    radii = poses[:, 2]
+    assert radii.min() >= 1.2 and radii.max() <= 2.0 and np.ptp(radii) > 0.7 and len(np.unique(radii)) == 216
+
+
+def test_test_poses_are_random_in_the_ranges():
+    poses = ViewProtocol(test_views=2000).test_poses("cup")
+    low, high = [math.radians(-30), 0, 1.2], [math.radians(30), 2 * math.pi, 2.0]
+    assert (poses >= low).all() and (poses <= high).all()
+    np.testing.assert_allclose(poses.mean(axis=0), np.mean([low, high], axis=0), rtol=0.05, atol=0.03)
+    assert ViewProtocol().test_poses("cup").shape == (8, 3)
+
+
+def test_poses_are_keyed_by_seed_and_name_alone():
+    protocol, other = ViewProtocol(), ViewProtocol(seed=1)
+    for poses in (ViewProtocol.training_poses, ViewProtocol.test_poses):
+        first = poses(protocol, "cup")
+        poses(protocol, "bowl")
+        np.testing.assert_array_equal(poses(protocol, "cup"), first)
+        assert not np.array_equal(poses(protocol, "bowl"), first) and not np.array_equal(poses(other, "cup"), first)
+    assert not np.isin(protocol.test_poses("cup")[:, 2], protocol.training_poses("cup")[:, 2]).any()
+
+
+def test_steps_that_do_not_divide_the_range_stay_inside_it():
+    poses = ViewProtocol(latitude_step_degrees=25, longitude_step_degrees=100).training_poses("cup")
+    np.testing.assert_allclose(np.unique(np.degrees(poses[:, 0]).round(6)), [-30, -5, 20])
+    np.testing.assert_allclose(np.unique(np.degrees(poses[:, 1]).round(6)), [0, 100, 200, 300])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"resolution": 0}, {"field_of_view_degrees": 180}, {"lowest_latitude_degrees": 31}, {"test_views": -1},
+        {"highest_latitude_degrees": 91}, {"latitude_step_degrees": 0}, {"longitude_step_degrees": -15},
+        {"nearest_radius": 0}, {"farthest_radius": 1.0},
+    ],
+)  # fmt: skip
+def test_impossible_protocols_are_user_errors(wrong):
+    with pytest.raises(UserError, match="view protocol"):
+        ViewProtocol(**wrong)
+
+
+# ---------------------------------------------------------------- views on disk
+
+SMALL = ViewProtocol(resolution=16, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)  # 9 + 2 views
+
+
+class FlatRenderer(Renderer):
+    """Draws nothing but a colour; counts its views, and fails before view number `fails_at`."""
+
+    name = "flat"
+
+    def __init__(self, fails_at: int | None = None) -> None:
+        self.fails_at, self.drawn = fails_at, 0
+
+    def views(self, scene, camera_to_world, resolution, field_of_view_degrees):
+        for _ in camera_to_world:
+            if self.drawn == self.fails_at:
+                raise RuntimeError("killed")
+            self.drawn += 1
+            yield np.full((resolution, resolution, 4), self.drawn, np.uint8)
+
+
+def objects_named(*names: str) -> list[MeshObject]:
+    return [MeshObject(name, "unique", lambda: trimesh.Scene(painted_box())) for name in names]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_written_views_have_ifusions_layout(tmp_path):
+    protocol = ViewProtocol(resolution=32, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)
+    ready = []
+    assert render_object(*objects_named("cube"), tmp_path, protocol, RaycastRenderer(), ready.append)
+    assert sum(ready) == protocol.views_per_object() == 11
+    for split, poses in (("train", protocol.training_poses("cube")), ("test", protocol.test_poses("cube"))):
+        folder = tmp_path / "cube" / split
+        transform = json.loads((folder / "transform.json").read_text())
+        assert transform["camera_angle_x"] == pytest.approx(math.radians(49.1)) and transform["ambiguity"] == "unique"
+        files = [frame["file_path"] for frame in transform["frames"]]
+        assert files == [f"{index:03d}.png" for index in range(len(poses))]
+        assert sorted(path.name for path in (folder / "rgb").iterdir()) == files
+        matrices = torch.tensor([frame["transform_matrix"] for frame in transform["frames"]], dtype=torch.float64)
+        torch.testing.assert_close(matrices, camera_to_world(torch.from_numpy(poses)), rtol=0, atol=1e-12)
+        torch.testing.assert_close(view_pose(matrices), torch.from_numpy(poses), rtol=0, atol=1e-9)
+        latlon = torch.tensor([frame["latlon"] for frame in transform["frames"]], dtype=torch.float64)
+        torch.testing.assert_close(latlon, to_ifusion(torch.from_numpy(poses)), rtol=0, atol=1e-9)
+        expected = RaycastRenderer().render(objects_named("cube")[0].load(), matrices, 32, 49.1)
+        for name, pixels in zip(files, expected, strict=True):
+            image = Image.open(folder / "rgb" / name)
+            assert image.mode == "RGBA"
+            np.testing.assert_array_equal(np.asarray(image), pixels)
+    record = json.loads((tmp_path / "cube" / "render.json").read_text())
+    assert record["renderer"] == "raycast" and record["protocol"]["resolution"] == 32
+
+
+def test_unlabelled_objects_claim_no_ambiguity(tmp_path):
+    obj = MeshObject("cube", "unlabelled", lambda: trimesh.Scene(painted_box()))
+    render_object(obj, tmp_path, SMALL, FlatRenderer())
+    assert "ambiguity" not in json.loads((tmp_path / "cube" / "train" / "transform.json").read_text())
+
+
+def test_an_interrupted_object_leaves_nothing_and_the_next_run_completes(tmp_path):
+    first, second = objects_named("first", "second")
+    with pytest.raises(RuntimeError, match="killed"):
+        render_objects([first, second], tmp_path, SMALL, FlatRenderer(fails_at=11 + 5), workers=1)
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["first"]
+    finished = contents(tmp_path / "first")
+    resumed = FlatRenderer()
+    render_objects([first, second], tmp_path, SMALL, resumed, workers=1)
+    assert resumed.drawn == 11  # the second object's alone
+    assert contents(tmp_path / "first") == finished
+    assert len(contents(tmp_path / "second")) == 11 + 2 + 1
+    render_objects([first, second], tmp_path, SMALL, FlatRenderer(fails_at=0), workers=1)  # nothing left to do
+
+
+def test_finished_objects_are_believed_without_their_meshes_where_that_is_asked_for(tmp_path, capfd):
+    first, second = objects_named("first", "second")
+    render_objects([first], tmp_path, SMALL, FlatRenderer(), workers=1)
+    unloadable = MeshObject("first", "unique", lambda: pytest.fail("the mesh was loaded"))
+    resumed = FlatRenderer()
+    render_objects([unloadable, second], tmp_path, SMALL, resumed, workers=1, check_meshes=False)
+    assert resumed.drawn == 11  # the second object's alone
+    capfd.readouterr()
+    render_objects([unloadable, second], tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
+    render_objects([first, second], tmp_path, SMALL, FlatRenderer(), workers=1)
+    assert capfd.readouterr() == ("", "")  # no progress bar where there is nothing to render
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: (folder / "render.json").unlink(),
+        lambda folder: (folder / "render.json").write_text("{"),
+        lambda folder: (folder / "render.json").write_text("[]"),
+    ],
+)
+def test_a_folder_without_its_record_is_not_believed(tmp_path, damage):
+    render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
+    damage(tmp_path / "cube")
+    with pytest.raises(UserError, match="cube exists and was not rendered by this program"):
+        render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
+
+
+def test_other_labels_or_another_protocol_are_noticed_without_the_meshes(tmp_path):
+    (cube,) = objects_named("cube")
+    render_objects([cube], tmp_path, SMALL, FlatRenderer(), workers=1)
+    relabelled, other = replace(cube, ambiguity="twofold"), replace(SMALL, seed=1)
+    with pytest.raises(UserError, match=r"rendered differently \(ambiguity was unique, is twofold\)"):
+        render_objects([relabelled], tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
+    with pytest.raises(UserError, match=r"rendered differently \(seed was 0, is 1\)"):
+        render_objects([cube], tmp_path, other, FlatRenderer(), workers=1, check_meshes=False)
+
+
+def test_a_failed_run_gives_its_lock_back_while_its_error_is_still_looked_at(tmp_path):
+    with pytest.raises(RuntimeError) as caught:
+        render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(fails_at=3), workers=1)
+    with FileLock(tmp_path / ".render.lock", timeout=0):  # or the next run in this process would wait for ever
+        assert str(caught.value) == "killed"
+
+
+def test_an_interrupt_by_the_user_leaves_no_half_object(tmp_path):
+    def interrupt(_views: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer(), interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_run_left_is_removed(tmp_path):
+    leftover = tmp_path / ".cube.partial" / "train" / "rgb"
+    leftover.mkdir(parents=True)
+    (leftover / "777.png").write_bytes(b"half")
+    render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer())
+    assert [path.name for path in tmp_path.iterdir()] == ["cube"]
+    assert "777.png" not in {Path(name).name for name in contents(tmp_path / "cube")}
+
+
+def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
+    (obj,) = objects_named("cube")
+    render_object(obj, tmp_path, SMALL, FlatRenderer())
+    finer = ViewProtocol(resolution=24, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)
+    with pytest.raises(UserError, match=r"cube was rendered differently \(resolution was 16, is 24\); choose another"):
+        render_object(obj, tmp_path, finer, FlatRenderer())
+    other = MeshObject("cube", "unique", lambda: trimesh.Scene(vertex_coloured_torus()))
+    with pytest.raises(UserError, match=r"rendered differently.*mesh was"):
+        render_object(other, tmp_path, SMALL, FlatRenderer())
+    assert not render_object(obj, tmp_path, SMALL, FlatRenderer())
+
+
+def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
+    (tmp_path / "cube").mkdir()
+    (tmp_path / "cube" / "thesis.txt").write_text("precious")
+    with pytest.raises(UserError, match="cube exists and was not rendered by this program"):
+        render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer())
+    assert contents(tmp_path) == {"cube/thesis.txt": b"precious"}
+
+
+def test_a_full_disk_is_a_user_error_and_keeps_what_is_finished(tmp_path, monkeypatch):
+    save, room = Image.Image.save, [11 + 4]
+
+    def save_while_there_is_room(image, path, **options):
+        if room[0] == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        room[0] -= 1
+        save(image, path, **options)
+
+    monkeypatch.setattr(Image.Image, "save", save_while_there_is_room)
+    with pytest.raises(UserError, match=r"1 of 2 objects.*\n.*second.*the disk is full"):
+        render_objects(objects_named("first", "second"), tmp_path, SMALL, FlatRenderer(), workers=1)
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["first"]
+    assert len(contents(tmp_path / "first")) == 11 + 2 + 1
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b"])
+def test_names_that_cannot_be_folders(tmp_path, name):
+    with pytest.raises(UserError, match="cannot be an object's name"):
+        render_object(*objects_named(name), tmp_path, SMALL, FlatRenderer())
+
+
+def test_equal_names_are_refused(tmp_path):
+    with pytest.raises(UserError, match="same name: cube"):
+        render_objects(objects_named("cube", "ball", "cube"), tmp_path, SMALL, FlatRenderer())
+
+
+def test_processes_render_what_one_process_does_and_failures_are_listed_at_the_end(tmp_path):
+    painted_box().export(tmp_path / "box.ply")
+    vertex_coloured_torus().export(tmp_path / "torus.ply")
+    trimesh.creation.box().export(tmp_path / "plain.stl")
+    names = {"box": "box.ply", "bad": "missing.ply", "torus": "torus.ply", "plain": "plain.stl", "worse": "box.unknown"}
+    objects = [MeshObject(name, "unlabelled", partial(load_scene, tmp_path / file)) for name, file in names.items()]
+    for folder, workers in (("one", 1), ("two", 2)):
+        with (
+            pytest.warns(UserWarning, match=r"plain\.stl: .*no texture"),
+            pytest.raises(UserError, match="2 of 5 objects could not be rendered") as caught,
+        ):
+            render_objects(objects, tmp_path / folder, SMALL, RaycastRenderer(), workers=workers)
+        assert "bad: " in str(caught.value) and "worse: " in str(caught.value)
+        assert sorted(path.name for path in (tmp_path / folder).iterdir() if path.is_dir()) == ["box", "plain", "torus"]
+    for name in ("box", "plain", "torus"):
+        assert contents(tmp_path / "one" / name) == contents(tmp_path / "two" / name)
