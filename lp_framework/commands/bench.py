@@ -9,6 +9,7 @@ from statistics import median
 
 import numpy as np
 import torch
+from lightning.fabric.utilities import move_data_to_device
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
@@ -55,26 +56,28 @@ def run(config: DictConfig) -> None:
             seconds[name].append((time.perf_counter() - began) / done)
     rates = {name: 1 / median(values) for name, values in seconds.items()}
     per_pair = {name: kept[name] / pairs[name] for name in contenders}
+    ratio = {
+        "pairs_per_second": rates[FEATURE_SPACE] / rates[PLAIN],
+        "bytes_for_backward_per_pair": per_pair[FEATURE_SPACE] / per_pair[PLAIN],
+    }
+    measured = {
+        name: {"pairs_per_second": rates[name], "bytes_for_backward_per_pair": per_pair[name]} for name in contenders
+    }
     result = {
-        "loader": {
-            name: {"pairs_per_second": rates[name], "bytes_for_backward_per_pair": per_pair[name]} for name in contenders
-        },
-        "ratio": {
-            "pairs_per_second": rates[FEATURE_SPACE] / rates[PLAIN],
-            "bytes_for_backward_per_pair": per_pair[FEATURE_SPACE] / per_pair[PLAIN],
-        },
+        "loader": {**measured, "ratio": ratio},
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu",
         "threads": torch.get_num_threads(),
         "config": plain(config),
         "versions": versions(),
     }
     write_json(folder / "bench.json", result)
-    table = Table(title=f"training step, {config.backbone.arch} at {config.backbone.image_size} px", title_justify="left")
+    table = Table(
+        title=f"training step, {config.backbone.arch} at {config.backbone.image_size} px", title_justify="left"
+    )
     for column in ("loader", "pairs a second", "memory for backward, kB a pair"):
         table.add_column(column, justify="left" if column == "loader" else "right")
     for name in contenders:
         table.add_row(name, f"{rates[name]:.0f}", f"{per_pair[name] / 1024:.0f}")
-    ratio = result["ratio"]
     table.add_row("ratio", f"{ratio['pairs_per_second']:.1f} x", f"{ratio['bytes_for_backward_per_pair']:.2f} x")
     Console(highlight=False).print(table)
     print(f"results: {folder / 'bench.json'}")
@@ -115,12 +118,8 @@ def _plain(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
         )
 
 
-def _to(batch: PairBatch, device: torch.device) -> PairBatch:
-    return PairBatch(**{key: value if value is None else value.to(device) for key, value in vars(batch).items()})
-
-
 def _loss(model: PoseModel, batch: PairBatch, device: torch.device) -> torch.Tensor:
-    batch = _to(batch, device)
+    batch = move_data_to_device(batch, device)
     assert batch.images is not None  # no features are cached here
     features = model.encode(batch.images)
     true = batch.relative_poses()
@@ -130,7 +129,7 @@ def _loss(model: PoseModel, batch: PairBatch, device: torch.device) -> torch.Ten
 
 def _step(model: PoseModel, optimizer: torch.optim.Optimizer, batch: PairBatch, device: torch.device) -> None:
     optimizer.zero_grad()
-    _loss(model, batch, device).backward()  # type: ignore[no-untyped-call]
+    _loss(model, batch, device).backward()
     optimizer.step()
 
 
@@ -147,7 +146,7 @@ def _kept_for_backward(model: PoseModel, batch: PairBatch, device: torch.device)
 
     with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
         loss = _loss(model, batch, device)
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     return float(sum(storages.values())), len(batch)
 
 

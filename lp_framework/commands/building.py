@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 # Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
 OF_NO_USE = (
     r"The '\w+' does not have many workers",  # batches come from memory, in this process
+    r"Detected pickle protocol \d+ in the checkpoint",  # it is refused with a sentence of ours
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
     r"The number of training batches .* is smaller than the logging interval",
     r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk

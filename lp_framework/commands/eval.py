@@ -12,6 +12,7 @@ from rich.console import Console
 
 from lp_framework import registry
 from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
+from lp_framework.data.sources import RenderedData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint, load_model, newest_checkpoint
@@ -36,10 +37,13 @@ def run(config: DictConfig) -> None:
         **plain(config.trainer), default_root_dir=folder, logger=False, callbacks=bars, use_distributed_sampler=False
     )
     data.trainer = trainer
-    if trainer.is_global_zero:
-        data.prepare_data()
-    trainer.strategy.barrier("data")
+    data.validation_views = 0  # only training divides the training views
     split = "train" if config.protocol == "ifusion" else "test"
+    if trainer.is_global_zero:
+        if isinstance(data, RenderedData):
+            data.render()
+        data.data(split)  # makes the cache; other splits may be missing
+    trainer.strategy.barrier("data")
     evaluation = Evaluation(solver, starts, data.table(split), config.seed)
     loader = data.evaluation_dataloader(config.protocol, config.seed)
     trainer.test(evaluation, loader, verbose=False)
@@ -55,7 +59,7 @@ def run(config: DictConfig) -> None:
         return
     write_result(folder, result, evaluation.metrics, evaluation.table)
     pictures = save_pictures(folder / "pictures", evaluation, data.data(split))
-    console = Console(width=150 if not Console().is_terminal else None, highlight=False)
+    console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     names = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
     title = f"{names}, {result['pairs']} pairs ({config.protocol})"
     console.print(terminal_table(title, summary_rows(result)))

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.table import Table
 
 from lp_framework.data.pairs import ViewTable
@@ -60,7 +61,7 @@ def summary_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, floa
 
 def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) -> Table:
     """The paper's layout: at each threshold R and R(R), then SR and SR(R), then the median errors."""
-    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False, padding=(0, 1))
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
     table.add_column("", no_wrap=True)
     order = []
     for all_starts in (False, True):
@@ -71,9 +72,9 @@ def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) 
                 (f"{prefix}(R)@{degrees}", f"\n{prefix}(R)"),
             ):
                 order.append(name)
-                table.add_column(label, justify="right", min_width=4)
-    table.add_column("Rot.\n(deg)", justify="right")
-    table.add_column("Trans.", justify="right")
+                table.add_column(label, justify="right", min_width=5, no_wrap=True)
+    table.add_column("Rot.\n(deg)", justify="right", min_width=6)
+    table.add_column("Trans.", justify="right", min_width=6)
     for name, metrics in rows:
         shares = [f"{metrics[key]:.2f}".replace("0.", ".", 1) if metrics[key] < 0.995 else "1.0" for key in order]
         table.add_row(name, *shares, f"{metrics['rotation_error']:.1f}", f"{metrics['translation_error']:.2f}")

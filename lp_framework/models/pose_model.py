@@ -123,15 +123,18 @@ class PoseModel(LightningModule):
         assert batch.images is not None  # a batch has one or the other
         return self.encode(batch.images)
 
-    def on_train_epoch_start(self) -> None:
-        """Dropout draws from the global generator; a resumed run's draws are those of an uninterrupted one."""
-        torch.manual_seed((self.seed * 1_000_003 + self.current_epoch) * 1_009 + self.global_rank)
+    def on_train_batch_start(self, batch: PairBatch, batch_idx: int) -> None:
+        """Dropout draws from the global generator: keyed as the noise is, apart from it."""
+        torch.manual_seed(self._step_key() + (1 << 62))
 
     def _generator(self) -> torch.Generator:
         """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does."""
         generator = torch.Generator(self.device)
-        generator.manual_seed((self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank)
+        generator.manual_seed(self._step_key())
         return generator
+
+    def _step_key(self) -> int:
+        return (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank
 
     def _validation_noise(self, true: Tensor, pairs: Tensor) -> Tensor:
         """Noised poses keyed by pair: the same in every epoch, batching and number of processes."""

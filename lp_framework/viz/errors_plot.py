@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -144,7 +143,8 @@ def _write_card(axes: Axes, card: ObjectCard, side: float) -> None:
     """Name and class, then a bar and a number for each of the two shares; one data unit is an inch."""
     axes.set(xlim=(0, side), ylim=(0.62, 0))
     axes.axis("off")
-    name = textwrap.shorten(card.name.replace("_", " "), width=max(8, int(side * 13)), placeholder="…")
+    name, room = card.name.replace("_", " "), int(14.5 * side)  # about as many letters fit
+    name = name if len(name) <= room else name[: room - 1] + "…"
     axes.text(0, 0.1, name, va="center", fontsize=7.5, fontweight="bold")
     axes.plot([side - 0.04], [0.1], marker="s", markersize=5, color=CLASS_COLOURS[card.ambiguity], clip_on=False)
     left, width = 0.5, side - 0.5 - 0.28

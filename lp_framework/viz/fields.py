@@ -150,7 +150,8 @@ def field_figure(
     for row, content in enumerate(maps):
         axes = place(x, row, wide)
         if row == 0 and content.arrows is not None:
-            axes.set_title(f"at the true relative radius, {truth[2]:+.2f}", loc="right", color=MUTED, pad=3)
+            radius = f"{truth[2]:+.2f}".replace("-", "\u2212")
+            axes.set_title(f"at the true relative radius, {radius}", loc="right", color=MUTED, pad=3)
         quiver = draw_map(axes, content, truth, limit, greatest)
         axes.tick_params(labelbottom=row == len(maps) - 1)
         axes.set_ylabel("latitude")
@@ -176,17 +177,18 @@ def field_figure(
 def draw_map(axes: Axes, content: FieldMap, truth: NDArray, limit: float, greatest: float) -> Quiver | None:
     """Draw one map: latitudes within `limit` degrees; the longest arrow stands for a score of length `greatest`."""
     axes.set(xlim=(0, 360), ylim=(-limit, limit))
-    axes.set_aspect("auto")
     degrees(axes, "x", 60)
     degrees(axes, "y", 30)
     axes.spines[:].set(color=FAINT)
     axes.set_title(content.title, pad=3)
     if content.density is not None and content.density.energy is not None:
-        energy = content.density.energy
+        energy, latitude = content.density.energy, content.density.latitude
+        edge = (latitude[-1] - latitude[0]) / (len(latitude) - 1) / 2  # from a cell's centre
         axes.imshow(
             np.exp(energy.min() - energy), cmap=DENSITY, vmin=0, vmax=1, origin="lower", aspect="auto",
-            extent=(0, 360, -limit, limit), interpolation="bilinear", zorder=0,
+            extent=(0, 360, latitude[0] - edge, latitude[-1] + edge), interpolation="bilinear", zorder=0,
         )  # fmt: skip
+        axes.set(xlim=(0, 360), ylim=(-limit, limit))  # imshow fits them to the image
     quiver = None
     if content.arrows is not None and greatest > 0:
         grid = content.arrows

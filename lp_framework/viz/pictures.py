@@ -136,7 +136,7 @@ def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, ND
     solution = solver.solve(pairs, starts, evaluation.seed)
     model = getattr(solver, "model", None)
     if isinstance(model, PoseModel):
-        field = "score" if model.outputs == 3 else "probability exp(-E) and score"
+        field = "score" if model.outputs == 3 else "exp(-E) and score"
         maps = [with_field(way("", solution, starts), f"Learned {field}", model, pairs, truth)]
         oracle = FieldMap("")
         exact = ExactModel(model.kernel, truth, model.outputs)
@@ -152,10 +152,13 @@ def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, ND
 
 
 def way(title: str, solution: Solution, starts: Tensor) -> FieldMap:
-    """A map of what a solver did with the first pair of `solution`: starts, trajectories if any, ends, answer."""
+    """A map of what a solver did with the first pair of `solution`: starts, trajectories if any, ends, answer.
+
+    A solver whose answers are not as many as the starts has made candidates of its own: its map shows no starts.
+    """
     return FieldMap(
         title,
-        starts=starts[0].cpu().numpy(),
+        starts=starts[0].cpu().numpy() if solution.poses.shape == starts.shape else None,
         paths=None if solution.trajectory is None else solution.trajectory[0].cpu().numpy(),
         ends=solution.poses[0].detach().cpu().numpy(),
         chosen=int(solution.chosen[0]),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
@@ -36,6 +37,17 @@ def read_curves(path: Path) -> dict[str, Curve]:
     return {name: Curve(*np.array(points).T) for name, points in gathered.items()}
 
 
+def running_mean(values: NDArray, window: int) -> NDArray:
+    """Mean of the `window` values around each of `values` `[S]`; of fewer at the ends.
+
+    >>> running_mean(np.array([1.0, 2.0, 6.0, 4.0]), 3)
+    array([1.5, 3. , 4. , 5. ])
+    """
+    ones = np.ones(window)
+    mean: NDArray = np.convolve(values, ones, mode="same") / np.convolve(np.ones_like(values), ones, mode="same")
+    return mean
+
+
 @styled
 def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
     """The losses by their logged names on a log scale, and below them the learning rate where there is one."""
@@ -48,16 +60,28 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
         below.set(ylabel="learning rate", ylim=(0, None))
         below.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
         panels = [below]
+    drawn = []
     for name, curve in losses.items():
         colour, label = LOSSES.get(name, (MUTED, name))
-        marker = "o" if len(curve.step) <= 20 else ""
+        window = len(curve.step) // 20
+        if window > 1:
+            # Single batches scatter: they stay visible, pale, behind their running mean.
+            above.plot(*curve, color=colour, linewidth=0.6, alpha=0.3, zorder=1)
+            curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean of {window} records"
+        marker = "" if len(curve.step) > 30 else "o"
         above.plot(*curve, color=colour, label=label, clip_on=False, marker=marker, markersize=3.5)
-    if "val/loss" in losses:
+        drawn.append(curve.value)
+    shown = np.concatenate(drawn)
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    if len(shown):
+        above.set_ylim(shown.min() / 1.6, shown.max() * 1.3)
+    if "val/loss" in losses and np.isfinite(losses["val/loss"].value).any():
         step, value = losses["val/loss"]
         best = int(np.nanargmin(value))
         above.annotate(
             f"best {value[best]:.3g}", (step[best], value[best]), xytext=(0, 7), textcoords="offset points",
-            ha="right", fontsize=7.5, color=VERMILION,
+            ha="right", fontsize=7.5, color=VERMILION, zorder=5,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )  # fmt: skip
     above.set(yscale="log", ylabel="loss (log scale)")
     above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -1,0 +1,430 @@
+"""Pictures: what is drawn is right, at the level of arrays; files are whole."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.quiver import Quiver
+from torch import Tensor, nn
+
+from lp_framework.data.pairs import PairData, ViewTable
+from lp_framework.data.views import ObjectViews
+from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.metrics import summarise
+from lp_framework.geometry import camera_to_world, wrap_angle
+from lp_framework.models.backbones import Backbone
+from lp_framework.models.objectives import PoseKernel
+from lp_framework.models.pose_model import EnergyModel, ScoreModel
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver
+from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.starts import Grid as GridStarts
+from lp_framework.solvers.starts import Ring
+from lp_framework.viz import errors_plot
+from lp_framework.viz.errors_plot import ObjectCard, cumulative, errors_figure, objects_figure
+from lp_framework.viz.fields import FieldMap, Grid, broken_at_seam, field_figure, field_on_grid, pose_grid
+from lp_framework.viz.pictures import ExactModel, pair_contents, pick_pairs, save_pictures, save_training_picture
+from lp_framework.viz.style import ANSWER, save_figure
+from lp_framework.viz.training import Curve, read_curves, training_figure
+
+TRUTH = torch.tensor([0.3, 5.6, 0.2])
+IMAGE = np.zeros((8, 8, 3), dtype=np.uint8)
+
+# ------------------------------------------------------------ trajectories at the seam
+
+
+@settings(deadline=None)
+@given(
+    st.floats(-1000, 1000),
+    st.lists(st.tuples(st.floats(-175, 175), st.floats(-10, 10)), min_size=1, max_size=30),
+    st.booleans(),
+)
+def test_path_on_the_map_is_the_path_on_the_circle(start: float, steps: list[tuple[float, float]], reduced: bool):
+    longitude = start + np.cumsum([0.0, *(step for step, _ in steps)])
+    latitude = np.cumsum([0.0, *(step for _, step in steps)])
+    drawn_latitude, drawn = broken_at_seam(latitude, longitude % 360 if reduced else longitude)
+    assert drawn[~np.isnan(drawn)].min() >= 0 and drawn[~np.isnan(drawn)].max() <= 360
+    lengths = np.abs(np.diff(drawn))
+    assert np.nanmax(lengths) <= 180  # no line across the map
+    # Nothing is lost or added: the lengths are those of the steps, along both axes.
+    assert np.nansum(lengths) == pytest.approx(np.abs(np.diff(longitude)).sum(), abs=1e-6)
+    assert np.nansum(np.abs(np.diff(drawn_latitude))) == pytest.approx(np.abs(np.diff(latitude)).sum(), abs=1e-6)
+    for gap in np.flatnonzero(np.isnan(drawn)):
+        assert {drawn[gap - 1], drawn[gap + 1]} == {0.0, 360.0}
+        assert drawn_latitude[gap - 1] == drawn_latitude[gap + 1]
+
+
+def test_path_that_stays_on_the_map_is_left_alone():
+    latitude, longitude = broken_at_seam(np.array([1.0, 2.0, 3.0]), np.array([350.0, 340.0, 355.0]))
+    assert latitude.tolist() == [1, 2, 3] and longitude.tolist() == [350, 340, 355]
+
+
+# ------------------------------------------------------------ fields
+
+
+def test_grid_fills_the_map_at_one_radius():
+    poses = pose_grid(0.25, 12.0)
+    assert poses.shape == (10, 30, 3) and poses.dtype == torch.float32
+    latitude, longitude = torch.rad2deg(poses[:, 0, 0]), torch.rad2deg(poses[0, :, 1])
+    torch.testing.assert_close(latitude, torch.arange(-54.0, 60.0, 12.0))
+    torch.testing.assert_close(longitude, torch.arange(6.0, 360.0, 12.0))
+    assert (poses[..., 2] == 0.25).all()
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0])
+@pytest.mark.parametrize("target", ["line", "periodic"])
+def test_exact_field_on_the_grid_is_the_closed_form(target: str, sigma: float):
+    model = ExactModel(PoseKernel(target, sigma), TRUTH, outputs=1)
+    condition = model.condition(*model.encode(torch.zeros(2, 3, 8, 8))[:, None])
+    grid = field_on_grid(lambda pose: model.field(condition, pose), radius=0.4, spacing=12.0)
+    latitude, longitude = np.meshgrid(np.deg2rad(grid.latitude), np.deg2rad(grid.longitude), indexing="ij")
+    dlat, dlon = latitude - TRUTH[0].item(), longitude - TRUTH[1].item()
+    turns = 2 * math.pi * np.arange(-9, 10) if target == "periodic" else np.zeros(1)
+    images = dlon[..., None] + turns
+    density = np.exp(-(images**2) / (2 * sigma**2))
+    expected = np.stack(
+        [-dlat, -(density * images).sum(-1) / density.sum(-1), np.full_like(dlat, TRUTH[2].item() - 0.4)], axis=-1
+    )
+    np.testing.assert_allclose(grid.score, expected / sigma**2, atol=2e-5 / sigma**4)
+    energy = (dlat**2 + 0.2**2) / (2 * sigma**2) - np.log(density.sum(-1))
+    assert grid.energy is not None
+    np.testing.assert_allclose(grid.energy - grid.energy.min(), energy - energy.min(), atol=2e-5)
+
+
+def exact_map(starts: int = 3) -> FieldMap:
+    kernel = PoseKernel()
+    start = torch.tensor([[0.0, 0.0, 0.0], [0.4, 2.0, 0.0], [-0.4, 4.0, 0.0]])[:starts]
+    path = [start]
+    for _ in range(60):
+        path.append(path[-1] + 0.1 * kernel.score(path[-1], TRUTH))
+    arrows = field_on_grid(lambda pose: (kernel.score(pose, TRUTH), None), 0.2, 12.0)
+    paths = torch.stack(path, dim=1).numpy()
+    return FieldMap("Exact score", arrows, None, start.numpy(), paths, paths[:, -1], chosen=starts - 1)
+
+
+def test_field_figure_shows_arrows_ways_answer_and_truth():
+    content = exact_map()
+    figure = field_figure(IMAGE, IMAGE, TRUTH.numpy(), [content, content], "tram (twofold)", "worst: 36°")
+    maps = [axes for axes in figure.axes if axes.get_title("left") == "Exact score"]
+    assert len(maps) == 2 and [axes.get_title("left") for axes in figure.axes[:2]] == ["reference", "query"]
+    assert "tram (twofold)" in [text.get_text() for text in figure.texts]
+    for axes in maps:
+        assert axes.get_xlim() == (0, 360) and axes.get_ylim() == (-60, 60)
+        assert "latitude" in axes.get_ylabel()
+        (quiver,) = [artist for artist in axes.collections if isinstance(artist, Quiver)]
+        assert content.arrows is not None
+        np.testing.assert_allclose(quiver.U, content.arrows.score[..., 1].ravel())
+        np.testing.assert_allclose(quiver.V, content.arrows.score[..., 0].ravel())
+        stars = [line.get_xydata() for line in axes.lines if line.get_marker() == "*" and len(line.get_xdata())]
+        np.testing.assert_allclose(stars, [np.rad2deg([[5.6, 0.3]])], rtol=1e-6)
+        ways = [line for line in axes.lines if line.get_linestyle() == "-"]
+        assert len(ways) == 3 and [to_hex(line.get_color()) == ANSWER.lower() for line in ways] == [False, False, True]
+        for line in ways:
+            assert np.nanmax(np.abs(np.diff(line.get_xdata()))) <= 180
+            np.testing.assert_allclose(line.get_xydata()[-1], np.rad2deg([5.6, 0.3]), atol=0.5)
+    # The first start lies on the seam and is marked on both edges.
+    starts = np.concatenate([line.get_xdata() for line in maps[0].lines if line.get_markerfacecolor() == "white"])
+    assert sorted(starts.round()) == [0, 115, 229, 360]
+    assert maps[1].get_xlabel().startswith("longitude")
+    figure.draw_without_rendering()
+    labels = dict(zip(maps[1].get_xticks(), maps[1].get_xticklabels(), strict=True))
+    assert [labels[longitude].get_text() for longitude in (0, 60, 120)] == ["0°", "60°", "120°"]
+    assert 30 in maps[1].get_yticks()
+
+
+def test_map_of_steep_views_shows_the_truth():
+    steep = np.array([1.4, 0.0, 0.0])
+    figure = field_figure(IMAGE, IMAGE, steep, [FieldMap("Starts and answer")], "a", "b")
+    assert figure.axes[-1].get_ylim() == (-90, 90)
+
+
+def test_broken_model_is_drawn_too():
+    content = exact_map(1)
+    assert content.arrows is not None and content.paths is not None
+    nowhere = Grid(content.arrows.latitude, content.arrows.longitude, np.full_like(content.arrows.score, np.nan))
+    lost = FieldMap("Learned score", nowhere, None, content.starts, content.paths * np.nan, content.ends, 0)
+    field_figure(IMAGE, IMAGE, TRUTH.numpy(), [lost, lost], "a", "b").draw_without_rendering()
+
+
+# ------------------------------------------------------------ which pairs
+
+
+def test_pairs_are_picked_failures_first():
+    errors = np.array([3.0, 170.0, 1.0, 60.0, 8.0, 170.0, 5.0, 90.0])
+    objects = np.array([0, 1, 0, 0, 0, 1, 0, 1])
+    picks = pick_pairs(errors, objects, [True, False])
+    assert [pick.row for pick in picks] == [1, 3, 6, 2]  # ambiguous, worst, median, best
+    assert [pick.reason.split()[0] for pick in picks] == ["median", "worst", "median", "best"]
+    assert picks[0].reason == "median of 3 pairs without a unique answer"
+    assert picks[1].reason == "worst of 5 pairs with a unique answer"
+    assert picks == pick_pairs(errors, objects, [True, False])
+
+
+def test_unlabelled_pairs_are_picked_among_all():
+    assert [pick.row for pick in pick_pairs(np.array([1.0, 9.0, 2.0, 9.0]), np.zeros(4, int), [None])] == [1, 2, 0]
+
+
+def test_pair_without_an_answer_is_the_worst():
+    picks = pick_pairs(np.array([1.0, np.nan, 179.0]), np.zeros(3, int), [True])
+    assert [pick.row for pick in picks] == [1, 2, 0]
+
+
+def test_one_pair_is_one_picture():
+    assert len(pick_pairs(np.array([7.0]), np.zeros(1, int), [True])) == 1
+
+
+# ------------------------------------------------------------ errors
+
+
+def at(line: matplotlib.lines.Line2D, x: float) -> float:
+    """The value of a staircase at x."""
+    return float(line.get_ydata()[np.searchsorted(line.get_xdata(), x, side="right") - 1])
+
+
+@pytest.mark.parametrize("starts", [1, 9])
+def test_cumulative_curves_are_the_metrics(starts: int):
+    generator = torch.Generator().manual_seed(0)
+    rotation = 60 * torch.rand(70, starts, generator=generator).double() ** 2
+    rotation[0, 0] = 15.0  # at a threshold counts as within it
+    rotation[1] = torch.nan  # never within any
+    translation = rotation / 40
+    chosen = torch.randint(starts, (70,), generator=generator)
+    classes = ["unique"] * 40 + ["continuous"] * 30
+    figure = errors_figure(rotation.numpy(), translation.numpy(), chosen.numpy(), classes)
+    left, right = figure.axes
+    curves = {line.get_label(): line for line in left.lines if line.get_drawstyle() == "steps-post"}
+    assert len(curves) == 2 * (1 if starts == 1 else 2)
+    for name, rows in (("unique", slice(0, 40)), ("continuous", slice(40, 70))):
+        metrics = summarise(rotation[rows], translation[rows], chosen[rows])
+        for degrees in (5, 15, 30):
+            assert at(curves[name], degrees) == pytest.approx(metrics[f"R(R)@{degrees}"])
+            if starts > 1:
+                assert at(curves[f"{name}, all starts"], degrees) == pytest.approx(metrics[f"SR(R)@{degrees}"])
+    assert left.get_xlim() == (0, 180) and "rotation error" in left.get_xlabel()
+    assert {5, 15, 30} <= set(left.get_xticks()) and 0.2 in right.get_xticks()
+    assert "translation error" in right.get_xlabel()
+    keys = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert keys[:2] == ["unique (40 pairs)", "continuous (30 pairs)"]
+    assert ("all 9 starts" in keys) == (starts > 1)
+
+
+def test_cumulative_of_nothing_reached_is_zero():
+    x, share = cumulative(np.array([np.nan, np.inf, 200.0]), 180.0)
+    assert x.tolist() == [0, 180] and share.tolist() == [0, 0]
+
+
+# ------------------------------------------------------------ objects
+
+
+def names_on(figure: Figure) -> list[str]:
+    return [text.get_text() for axes in figure.axes for text in axes.texts if text.get_fontweight() == "bold"]
+
+
+def test_objects_are_sorted_worst_first():
+    cards = [
+        ObjectCard("good", "unique", IMAGE, 0.9, 0.9),
+        ObjectCard("tie_b", "unique", IMAGE, 0.5, 0.6),
+        ObjectCard("tie_a", "continuous", IMAGE, 0.5, 0.4),
+        ObjectCard("bad", "twofold", IMAGE, 0.1, 0.8),
+    ]
+    figure = objects_figure(cards)
+    assert names_on(figure) == ["bad", "tie a", "tie b", "good"]
+    numbers = [text.get_text() for text in figure.axes[1].texts]
+    assert numbers == ["bad", "R(R)@15", "0.10", "SR(R)@30", "0.80"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["unique", "twofold", "continuous"]
+
+
+def test_sheet_of_many_objects_keeps_the_worst(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(errors_plot, "MOST_OBJECTS", 9)
+    cards = [ObjectCard(f"a name of some length {i}", "unlabelled", IMAGE, i / 12, 0.0) for i in range(12)]
+    figure = objects_figure(cards)
+    assert len(names_on(figure)) == 9 and "the 9 worst of 12" in figure.texts[0].get_text()
+    # Cards do not overlap, and stay on the page.
+    boxes = [axes.get_position() for axes in figure.axes]
+    assert all(box.x0 >= 0 and box.x1 <= 1 and box.y0 >= -1e-9 and box.y1 <= 1 for box in boxes)
+    assert not any(
+        a.x0 < b.x1 - 1e-9 and b.x0 < a.x1 - 1e-9 and a.y0 < b.y1 - 1e-9 and b.y0 < a.y1 - 1e-9
+        for i, a in enumerate(boxes)
+        for b in boxes[:i]
+    )
+
+
+# ------------------------------------------------------------ training
+
+METRICS = """epoch,lr-AdamW,step,train/loss,train/view_loss,val/loss
+,0.001,19,,,
+0,,19,1.5,1.25,
+,0.0005,39,,,
+0,,39,0.75,,
+0,,41,,,0.5
+"""
+
+
+def test_training_curves_come_from_the_log(tmp_path: Path):
+    assert save_training_picture(tmp_path) == []
+    (tmp_path / "metrics.csv").write_text(METRICS)
+    curves = read_curves(tmp_path / "metrics.csv")
+    assert curves["train/loss"].step.tolist() == [19, 39] and curves["train/loss"].value.tolist() == [1.5, 0.75]
+    assert curves["val/loss"].value.tolist() == [0.5] and curves["lr-AdamW"].value.tolist() == [0.001, 0.0005]
+    assert save_training_picture(tmp_path) == [tmp_path / "training.png"]
+    assert (tmp_path / "training.pdf").is_file()
+
+
+def test_training_figure_has_losses_on_a_log_scale_over_the_rate():
+    steps = np.array([10.0, 20.0, 30.0])
+    losses = {"train/loss": Curve(steps, np.array([1.0, 0.1, 0.01])), "val/loss": Curve(steps, np.array([1, 0.2, 0.4]))}
+    figure = training_figure(losses, Curve(steps, steps))
+    above, below = figure.axes
+    assert above.get_yscale() == "log" and "learning rate" in below.get_ylabel() and "step" in below.get_xlabel()
+    assert [line.get_label() for line in above.lines] == ["training loss", "validation loss"]
+    assert [text.get_text() for text in above.texts] == ["best 0.2"]
+    assert len(training_figure({"train/loss": losses["train/loss"]}, None).axes) == 1
+
+
+def test_scattered_losses_are_averaged_and_a_diverged_run_is_drawn():
+    steps, values = np.arange(100.0), np.tile([1.0, 3.0], 50)
+    (axes,) = training_figure({"train/loss": Curve(steps, values)}, None).axes
+    raw, mean = axes.lines
+    np.testing.assert_array_equal(raw.get_ydata(), values)
+    assert np.abs(mean.get_ydata() - 2).max() < 0.6 and mean.get_label() == "training loss, mean of 5 records"
+    lost = Curve(steps, np.full(100, np.nan))
+    training_figure({"train/loss": lost, "val/loss": lost}, None).draw_without_rendering()
+
+
+# ------------------------------------------------------------ files
+
+
+def test_figures_are_saved_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    figure = training_figure({"train/loss": Curve(np.arange(3.0), np.ones(3))}, None)
+    files = save_figure(figure, tmp_path / "new" / "training")
+    assert [file.name for file in files] == ["training.png", "training.pdf"]
+    assert imread(files[0]).shape[1] == 1600  # 8 inches at 200 dots
+    before = [file.read_bytes() for file in files]
+    assert before[1].startswith(b"%PDF") and before[1].rstrip().endswith(b"%%EOF")
+    save_figure(figure, tmp_path / "new" / "training")
+    assert [file.read_bytes() for file in files] == before
+
+    def fails(self: Figure, file: Path, **settings: object) -> None:
+        Path(file).write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Figure, "savefig", fails)
+    with pytest.raises(OSError, match="disk full"):
+        save_figure(figure, tmp_path / "new" / "training")
+    assert sorted(tmp_path.glob("new/.*")) == [] and [file.read_bytes() for file in files] == before
+
+
+def test_callers_settings_are_left_alone_and_have_no_say():
+    with matplotlib.rc_context({"axes.facecolor": "black", "font.size": 30}):
+        before = dict(matplotlib.rcParams)
+        figure = training_figure({"train/loss": Curve(np.arange(3.0), np.ones(3))}, None)
+        assert dict(matplotlib.rcParams) == before
+    assert figure.axes[0].xaxis.label.get_fontsize() == 8
+
+
+# ------------------------------------------------------------ pictures of an evaluation
+
+
+class Means(Backbone):
+    """Mean colours."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.image_size, self.trunk_dim, self.feature_dim, self.frozen = 8, 3, 3, False
+        self.head = nn.Identity()
+
+    def trunk_features(self, images: Tensor) -> Tensor:
+        return images.mean(dim=(2, 3))
+
+
+class Guess(Solver):
+    """Neither model nor trajectory; its answer is no turn at all."""
+
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        poses = torch.zeros(len(pairs), 1, 3)
+        valid = torch.ones(len(pairs), 1, dtype=torch.bool)
+        return Solution(poses, torch.zeros(len(pairs), 1), valid, torch.zeros(len(pairs), dtype=torch.long), Cost(0, 0))
+
+
+@pytest.fixture
+def data() -> PairData:
+    generator = torch.Generator().manual_seed(1)
+    objects = []
+    for name, ambiguity, unique in (("red_cup", "unique", True), ("$vase_", "continuous", False)):
+        poses = torch.rand(4, 3, generator=generator).double() * torch.tensor([0.5, 6.28, 0.8]) + torch.tensor(
+            [0, 0, 1.2]
+        )
+        files = [Path(f"{view:03d}.png") for view in range(4)]
+        objects.append(ObjectViews(name, "test", ambiguity, unique, files, camera_to_world(poses), 0.857))
+    images = torch.randint(0, 256, (8, 8, 8, 3), generator=generator, dtype=torch.uint8).numpy()
+    return PairData(ViewTable(objects), images, None)
+
+
+def evaluated(solver: Solver, data: PairData, starts: Ring | GridStarts) -> Evaluation:
+    evaluation = Evaluation(solver, starts, data.table, seed=0)
+    with torch.no_grad():
+        evaluation.test_step(data[data.table.pairs()], 0)
+    return evaluation
+
+
+@pytest.mark.parametrize("kind", [ScoreModel, EnergyModel])
+def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel | EnergyModel], data: PairData):
+    torch.manual_seed(0)
+    model = kind(Means(), hidden=8, layers=1)
+    solver = Langevin(model, gamma=0.0, iterations=100)
+    evaluation = evaluated(solver, data, GridStarts())
+    batch = data[data.table.pairs()[:1]]
+    _, _, truth, (learned, exact) = pair_contents(evaluation, batch)
+    assert solver.trajectory is False and solver.model is model  # the evaluated solver stays as it was
+    np.testing.assert_allclose(truth, batch.relative_poses()[0])
+    assert learned.paths is not None and learned.paths.shape == (9, 101, 3)
+    # Solved again, the pair has the evaluation's answer.
+    answer = evaluation.metrics.rows()["answer"][0].numpy()
+    assert learned.ends is not None and learned.chosen is not None
+    np.testing.assert_allclose(learned.ends[learned.chosen], answer, atol=1e-4)
+    # The arrows are the model's score at the true radius.
+    assert batch.images is not None and learned.arrows is not None and exact.arrows is not None
+    features = model.encode(batch.images)
+    condition = model.condition(features[batch.reference], features[batch.query])
+    pose = pose_grid(float(truth[2]), 12.0)
+    np.testing.assert_allclose(learned.arrows.score, model.field(condition, pose).score.detach(), atol=1e-5)
+    np.testing.assert_allclose(exact.arrows.score, model.kernel.score(pose, torch.tensor(truth)), atol=1e-6)
+    # With the exact score every start arrives.
+    assert exact.ends is not None
+    offset = torch.tensor(exact.ends - truth)
+    offset[:, 1] = wrap_angle(offset[:, 1])
+    assert offset.abs().max() < 2e-2
+    assert (learned.density is not None) == (exact.density is not None) == (kind is EnergyModel)
+
+
+@pytest.mark.parametrize(("with_model", "count"), [(True, 4), (False, 1)])
+def test_pictures_of_an_evaluation(with_model: bool, count: int, data: PairData, tmp_path: Path):
+    solver = Langevin(ScoreModel(Means(), hidden=8, layers=1), iterations=5) if with_model else Guess()
+    evaluation = evaluated(solver, data, Ring(count))
+    files = save_pictures(tmp_path / "pictures", evaluation, data)
+    names = [file.stem for file in files]
+    assert names == [*(f"field_{number}" for number in range(len(names) - 2)), "errors", "objects"]
+    assert 3 <= len(names) - 2 <= 4
+    for file in files:
+        image = imread(file)
+        assert image.shape[1] == 1600 and image[..., :3].std() > 0.02  # something is on it
+        assert file.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+    assert {file.suffix for file in (tmp_path / "pictures").iterdir()} == {".png", ".pdf"}
+
+
+def test_solver_without_model_has_one_map_without_arrows(data: PairData):
+    evaluation = evaluated(Guess(), data, Ring(4))
+    _, _, _, maps = pair_contents(evaluation, data[data.table.pairs()[:1]])
+    assert len(maps) == 1 and maps[0].arrows is None and maps[0].paths is None
+    figure = field_figure(IMAGE, IMAGE, TRUTH.numpy(), maps, "a", "b")
+    assert len(figure.axes) == 3  # two images, one map, no colour bar
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["true pose", "answer"]
