@@ -9,7 +9,6 @@ import importlib.metadata
 import os
 import sys
 
-
 from lp_framework.errors import UserError, nearest
 
 COMMANDS = {  # the module of a command is lp_framework.commands.NAME

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import math
 import shlex
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,21 +32,23 @@ from lp_framework.models.checkpoints import BEST, FOLDER, LAST, RECIPE, KeepReci
 from lp_framework.viz.pictures import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
+REPORT = "training.json"
 
 
 @orderly_console()
 def run(config: DictConfig) -> None:
     """Train into this run's folder, or go on in the folder that `resume` names."""
     folder = run_folder()
-    last = None
+    last, checkpoint = None, None
     if config.resume is not None:
         folder = Path(config.resume)
-        last = folder / FOLDER / LAST
         config = resumed_config(folder, config, HydraConfig.get().overrides.task)
+        last, checkpoint = last_checkpoint(folder)
     recipe = {"model": plain(config.model), "backbone": plain(config.backbone)}
-    checkpoint = read_checkpoint(last) if last is not None else None
     if checkpoint is not None and checkpoint[RECIPE] != recipe:
         raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
+    if checkpoint is not None and is_finished(folder, config, checkpoint):
+        raise UserError(f"resume={folder}: has done all of its epochs; trainer.max_epochs=N would prolong it")
     seed_everything(config.seed, verbose=False)
     data = build_data(config)
     backbone = registry.build("backbone", config.backbone)
@@ -74,7 +77,7 @@ def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -
     A run may be prolonged or moved to other devices; all else stays as it was, and `UserError` is raised for it.
     """
     saved = folder / "config.yaml"
-    if not (folder / FOLDER / LAST).is_file() or not saved.is_file():
+    if not saved.is_file() or not any((folder / FOLDER / name).is_file() for name in (LAST, BEST)):
         raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
     previous = OmegaConf.load(saved)
     assert isinstance(previous, DictConfig)
@@ -84,6 +87,24 @@ def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -
             raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
         OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
     return previous
+
+
+def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """The last checkpoint of the run in `folder`, or its best where the last one was cut short by the run's end."""
+    last, best = folder / FOLDER / LAST, folder / FOLDER / BEST
+    try:
+        return last, read_checkpoint(last)
+    except UserError as error:
+        if not best.is_file():
+            raise
+        warnings.warn(f"{error}; going on from {best}", stacklevel=2)
+        return best, read_checkpoint(best)
+
+
+def is_finished(folder: Path, config: DictConfig, checkpoint: Mapping[str, Any]) -> bool:
+    """Whether the run of a checkpoint has nothing left to do, its report included."""
+    epochs = config.trainer.max_epochs
+    return epochs is not None and 0 <= epochs <= checkpoint["epoch"] + 1 and (folder / REPORT).is_file()
 
 
 def callbacks(config: DictConfig, folder: Path, recipe: dict[str, Any]) -> list[Callback]:
@@ -129,11 +150,11 @@ def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
 
 
 def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any]) -> None:
-    """`training.json` and the closing lines."""
+    """`REPORT` and the closing lines."""
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
     write_json(
-        folder / "training.json",
+        folder / REPORT,
         {**recipe, "seed": config.seed, "epochs": trainer.current_epoch, "steps": trainer.global_step,
          "final": losses, "versions": versions()},
     )  # fmt: skip

@@ -1,0 +1,85 @@
+"""Starts: where they lie, and what they depend on."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+
+from lp_framework import registry
+from lp_framework.errors import UserError
+from lp_framework.solvers.starts import Grid, Random, Ring
+
+IDS = torch.tensor([5, 17, 2**62 + 11, 0])
+
+
+@pytest.mark.parametrize("name", registry.names("start"))
+def test_every_kind_of_start_keeps_its_contract(name):
+    starts = registry.build("start", {"name": name})
+    first, again = starts.make(IDS, seed=3), starts.make(IDS, seed=3)
+    assert first.ndim == 3
+    assert first.shape[0] == len(IDS)
+    assert first.shape[2] == 3
+    assert first.dtype == torch.float32
+    assert first.isfinite().all()
+    assert torch.equal(first, again)
+    order = torch.tensor([2, 0, 3, 1])
+    assert torch.equal(starts.make(IDS[order], seed=3), first[order])
+    assert torch.equal(torch.cat([starts.make(IDS[:1], seed=3), starts.make(IDS[1:], seed=3)]), first)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_a_ring_goes_evenly_around(count):
+    starts = Ring(count, latitude=0.3).make(IDS, seed=0)
+    expected = torch.tensor([[0.3, 2 * math.pi * each / count, 0.0] for each in range(count)])
+    torch.testing.assert_close(starts, expected.expand(4, -1, -1))
+
+
+def test_the_default_ring_is_ifusions():
+    longitudes = Ring().make(IDS, seed=0)[0, :, 1].rad2deg()
+    torch.testing.assert_close(longitudes, torch.tensor([0.0, 90.0, 180.0, 270.0]))
+
+
+def test_the_default_grid_has_the_papers_nine():
+    starts = Grid().make(IDS, seed=0)
+    found = {tuple(round(math.degrees(angle)) for angle in pose[:2]) for pose in starts[1].tolist()}
+    assert found == {(latitude, longitude) for latitude in (-30, 0, 30) for longitude in (0, 120, 240)}
+    assert starts.shape == (4, 9, 3)
+    assert (starts[..., 2] == 0).all()
+
+
+def test_random_starts_fill_their_band_evenly():
+    starts = Random(count=8, latitude=0.4).make(torch.arange(2_000), seed=0).reshape(-1, 3).double()
+    assert stats.kstest(starts[:, 0].numpy(), stats.uniform(-0.4, 0.8).cdf).pvalue > 1e-3
+    assert stats.kstest(starts[:, 1].numpy(), stats.uniform(0, 2 * math.pi).cdf).pvalue > 1e-3
+    assert (starts[:, 2] == 0).all()
+    assert torch.corrcoef(starts[:, :2].T)[0, 1].abs() < 0.03
+
+
+def test_random_starts_depend_on_pair_and_seed():
+    starts = Random(count=2)
+    first = starts.make(IDS, seed=0)
+    assert not torch.equal(first[0], first[1])
+    assert not torch.equal(first[:, 0], first[:, 1])
+    assert not torch.equal(first, starts.make(IDS, seed=1))
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_fewer_random_starts_are_the_first_of_more(count):
+    assert torch.equal(Random(count).make(IDS, seed=0), Random(8).make(IDS, seed=0)[:, :count])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Ring(0), "start.count must be at least 1, got 0"),
+        (lambda: Random(0), "start.count must be at least 1, got 0"),
+        (lambda: Random(latitude=2.0), r"start.latitude must lie in \[0, pi/2\), got 2.0"),
+        (lambda: Grid([], [0.0]), "at least one angle each"),
+    ],
+)
+def test_bad_settings_are_named(build, message):
+    with pytest.raises(UserError, match=message):
+        build()

@@ -1,0 +1,272 @@
+"""`train` from the command line: what a run leaves, resuming after kill -9, two processes, stopping early, errors."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import shutil
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_runs import Commands, Ran
+
+from lp_framework.models.checkpoints import find_checkpoint, load_model, newest_checkpoint, read_checkpoint
+
+EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6", "backbone.pause=0.1")
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory) -> Commands:
+    return Commands(tmp_path_factory.mktemp("training"))
+
+
+@pytest.fixture(scope="module")
+def score(commands) -> Ran:
+    """A score model after three epochs."""
+    ran = commands.here("score", "train")
+    assert ran.status == 0, ran.err
+    return ran
+
+
+@pytest.fixture(scope="module")
+def whole(commands) -> Ran:
+    """An uninterrupted run with a moving average and dropout."""
+    ran = commands.here("whole", "train", *EVERYTHING)
+    assert ran.status == 0, ran.err
+    return ran
+
+
+@pytest.fixture(scope="module")
+def killed(commands) -> Path:
+    """The same run, killed as soon as its first checkpoint is there."""
+    process = commands.start("killed", "train", *EVERYTHING)
+    last = commands.folder / "killed" / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 100
+    while not last.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    return last.parents[1]
+
+
+def rows(ran_folder: Path) -> list[dict[str, str]]:
+    with (ran_folder / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def assert_equal(one: Any, two: Any, place: str = "") -> None:
+    """Equal to the last bit, tensors included."""
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, two), place
+    elif isinstance(one, dict):
+        assert one.keys() == two.keys(), place
+        for key in one:
+            assert_equal(one[key], two[key], f"{place}/{key}")
+    elif isinstance(one, list):
+        assert len(one) == len(two), place
+        for index, (first, second) in enumerate(zip(one, two, strict=True)):
+            assert_equal(first, second, f"{place}/{index}")
+    else:
+        assert one == two, place
+
+
+# ---------------------------------------------------------------- a run
+
+
+def test_a_run_leaves_checkpoints_config_metrics_and_its_log(score):
+    for name in ("checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml", "train.log", "training.json"):
+        assert (score.folder / name).is_file(), name
+    summary = score.json("training.json")
+    assert summary["epochs"] == 3
+    assert summary["model"]["name"] == "score"
+    assert summary["backbone"]["name"] == "tmp_tiny"
+    losses = [float(row["val/loss"]) for row in rows(score.folder) if row["val/loss"]]
+    assert len(losses) == 3
+    assert losses[-1] < losses[0]
+    assert summary["final"]["val/loss"] == pytest.approx(losses[-1], rel=1e-6)
+
+
+def test_the_console_ends_with_the_model_and_the_next_command(score):
+    lines = [" ".join(line.split()) for line in score.out.splitlines()]
+    assert f"model: {score.folder / 'checkpoints' / 'best.ckpt'}" in lines
+    assert lines[-1] == f"next: python -m lp_framework eval checkpoint={score.folder}"
+
+
+def test_the_console_has_no_notes_and_advertisements(score, commands):
+    assert score.err == ""
+    assert "Tip" not in score.out
+    assert "Tip" in (score.folder / "train.log").read_text()  # Lightning's notes are in the log
+    ran = commands.process("alone", "train", "trainer.max_epochs=1")  # where nobody has set up logging before
+    assert (ran.status, ran.err) == (0, "")
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_gives_others(score, commands):
+    again = commands.here("again", "train")
+    assert_equal(again.checkpoint()["state_dict"], score.checkpoint()["state_dict"])
+    other = commands.here("other", "train", "seed=1").checkpoint()["state_dict"]
+    assert any(not torch.equal(value, other[key]) for key, value in score.checkpoint()["state_dict"].items())
+
+
+def test_a_checkpoint_names_its_model_and_lacks_the_frozen_trunk(score, whole):
+    for ran in (score, whole):
+        checkpoint = ran.checkpoint()
+        assert checkpoint["lp_framework"]["model"]["name"] == "score"
+        assert checkpoint["lp_framework"]["backbone"]["name"] == "tmp_tiny"
+        for state in {"state_dict", "current_model_state"} & checkpoint.keys():
+            assert not any(key.startswith("backbone.net") for key in checkpoint[state])
+            assert any(key.startswith("backbone.head") for key in checkpoint[state])
+    assert "current_model_state" in whole.checkpoint()
+
+
+def test_a_trained_trunk_is_trained_and_saved(commands):
+    ran = commands.here("trunk", "train", "backbone.frozen=false", "trainer.max_epochs=1")
+    weights = ran.checkpoint()["state_dict"]
+    start = torch.randn(weights["backbone.net.0.weight"].shape, generator=torch.Generator().manual_seed(0)) / 5
+    assert (weights["backbone.net.0.weight"] - start).abs().max() > 1e-4
+
+
+def test_the_best_checkpoint_is_that_of_the_least_validation_loss(score):
+    losses = [(float(row["val/loss"]), int(row["epoch"])) for row in rows(score.folder) if row["val/loss"]]
+    assert score.checkpoint("best.ckpt")["epoch"] == min(losses)[1]
+
+
+def test_a_moving_average_lags_behind_the_weights(whole):
+    checkpoint = whole.checkpoint()
+    average, current = checkpoint["state_dict"], checkpoint["current_model_state"]
+    assert average.keys() == current.keys()
+    assert any(not torch.equal(average[key], current[key]) for key in average)
+
+
+def test_training_stops_where_the_validation_loss_no_longer_falls(commands):
+    ran = commands.here("stopped", "train", "patience=1", "model.learning_rate=0.0", "trainer.max_epochs=9")
+    assert ran.json("training.json")["epochs"] == 2
+
+
+def test_no_validation_views_train_on_all_and_keep_the_last(commands):
+    ran = commands.here("unvalidated", "train", "data.validation_views=0", "trainer.max_epochs=1")
+    assert ran.status == 0, ran.err
+    assert ran.checkpoint("best.ckpt")["global_step"] == ran.checkpoint()["global_step"] > 0
+    assert "val/loss" not in ran.json("training.json")["final"]
+
+
+@pytest.mark.parametrize("setting", ["model.noise=gaussian", "model.target=line", "model.schedule=constant"])
+def test_the_papers_alternatives_train(commands, setting):
+    ran = commands.here(setting.replace("=", "_"), "train", setting, "model.view_loss=0", "trainer.max_epochs=1")
+    assert ran.status == 0, ran.err
+    assert ran.json("training.json")["final"]["val/loss"] > 0
+
+
+# ---------------------------------------------------------------- resuming
+
+
+def test_resuming_after_kill_9_gives_the_weights_of_an_uninterrupted_run(commands, whole, killed):
+    begun = torch.load(killed / "checkpoints" / "last.ckpt", weights_only=True)
+    assert 1 <= begun["epoch"] + 1 < 6  # it was killed on the way
+    resumed = commands.here("resumed", "train", "resume=killed")
+    assert resumed.status == 0, resumed.err
+    end, wanted = (
+        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True) for folder in (killed, whole.folder)
+    )
+    assert end["epoch"] == wanted["epoch"] == 5
+    for part in ("state_dict", "current_model_state", "optimizer_states", "lr_schedulers"):
+        assert_equal(end[part], wanted[part], part)
+    best, wanted_best = (
+        torch.load(folder / "checkpoints" / "best.ckpt", weights_only=True) for folder in (killed, whole.folder)
+    )
+    assert_equal(best["state_dict"], wanted_best["state_dict"])
+
+
+def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
+    commands.here("prolonged", "train", "trainer.max_epochs=2")
+    first = rows(commands.folder / "prolonged")
+    ran = commands.here("onwards", "train", "resume=prolonged", "trainer.max_epochs=3")
+    assert ran.status == 0, ran.err
+    every = rows(commands.folder / "prolonged")
+    assert [row["val/loss"] for row in every[: len(first)]] == [row["val/loss"] for row in first]
+    assert [row["epoch"] for row in every if row["val/loss"]] == ["0", "1", "2"]
+    finished = commands.here("finished", "train", "resume=prolonged")  # not up to the default number of epochs
+    assert finished.error == "resume=prolonged: has done all of its epochs; trainer.max_epochs=N would prolong it"
+    (commands.folder / "prolonged" / "training.json").unlink()  # as if it had been killed at the very end
+    assert commands.here("reported", "train", "resume=prolonged").status == 0
+    assert (commands.folder / "prolonged" / "training.json").is_file()
+
+
+@pytest.mark.parametrize("cut", ["shortened", "missing"])
+def test_a_last_checkpoint_cut_short_gives_way_to_the_best(commands, score, cut):
+    """A kill while a checkpoint is written, where temporary files and runs lie on different disks."""
+    folder = shutil.copytree(score.folder, commands.folder / cut)
+    last = folder / "checkpoints" / "last.ckpt"
+    contents = last.read_bytes()
+    last.unlink()
+    if cut == "shortened":
+        last.write_bytes(contents[:5000])
+    ran = commands.here(f"after_{cut}", "train", f"resume={cut}", "trainer.max_epochs=4")
+    assert ran.status == 0, ran.err
+    assert re.search(r"WARNING: .*last\.ckpt: .*; going on from .*best\.ckpt", ran.err)
+    assert torch.load(last, weights_only=True)["epoch"] == 3
+
+
+def test_resuming_what_is_not_there_is_named(commands):
+    ran = commands.here("nothing", "train", "resume=nowhere")
+    assert ran.error.startswith("resume=nowhere: holds no checkpoints/last.ckpt to go on from")
+
+
+def test_a_resumed_run_keeps_its_settings(commands, score):
+    ran = commands.here("changed", "train", "resume=score", "model.hidden=32")
+    assert ran.error == (
+        f"model.hidden cannot be changed by a resumed run: {Path('score/config.yaml')} says what it is; leave it out"
+    )
+
+
+def test_the_checkpoint_of_another_model_is_not_resumed(commands, score):
+    shutil.copytree(score.folder, commands.folder / "mixed")
+    ran = commands.here("energy", "train", "model=energy", "trainer.max_epochs=1")
+    shutil.copy(ran.folder / "checkpoints" / "last.ckpt", commands.folder / "mixed" / "checkpoints" / "last.ckpt")
+    assert "is of another model than this config's" in commands.here("wrong", "train", "resume=mixed").error
+
+
+# ---------------------------------------------------------------- two processes
+
+
+def test_two_processes_report_the_validation_loss_of_one(commands):
+    settings = ("model.learning_rate=0.0", "trainer.max_epochs=1", "data.batch_pairs=7")  # 24 pairs: 4 batches, 2 each
+    one = commands.here("one", "train", *settings)
+    odd = commands.here("odd", "train", *settings[:2], "data.batch_pairs=5")  # 5 batches: one is met twice
+    spread = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
+    two = commands.process("two", "train", *settings[:2], "data.batch_pairs=5", *spread)
+    assert two.status == 0, two.err
+    losses = [ran.json("training.json")["final"]["val/loss"] for ran in (one, odd, two)]
+    assert losses == pytest.approx([losses[0]] * 3, rel=1e-6)
+    assert two.err == ""
+    assert "MEMBER: 1/2" in (two.folder / "train.log").read_text()  # there were two
+    weights = [ran.checkpoint()["state_dict"] for ran in (odd, two)]
+    assert_equal(*weights)  # nothing was learned, so all three looked at the same network
+
+
+# ---------------------------------------------------------------- checkpoint files
+
+
+def test_a_run_a_checkpoint_and_the_latest_run_are_found(score, commands, tmp_path):
+    best = score.folder / "checkpoints" / "best.ckpt"
+    assert find_checkpoint(score.folder) == best
+    assert find_checkpoint(score.folder / "checkpoints") == best
+    assert find_checkpoint(best) == best
+    for age, name in enumerate(("new", "old")):
+        shutil.copytree(score.folder / "checkpoints", tmp_path / name / "checkpoints")
+        last = tmp_path / name / "checkpoints" / "last.ckpt"
+        os.utime(last, (1e9 - age, 1e9 - age))
+    assert newest_checkpoint(tmp_path) == tmp_path / "new" / "checkpoints" / "best.ckpt"
+    (tmp_path / "new" / "checkpoints" / "best.ckpt").unlink()
+    assert newest_checkpoint(tmp_path).name == "last.ckpt"
+
+
+def test_reading_a_checkpoint_runs_no_code_of_it(score):
+    assert read_checkpoint(score.folder / "checkpoints" / "last.ckpt")["epoch"] == 2
+    with pytest.raises(ValueError, match="there is no backbone 'tmp_tiny'"):
+        load_model(score.folder)  # the plugin is not loaded here
