@@ -213,6 +213,7 @@ SHARE = """
     torchvision_ops.install()
     import torch
     from lp_framework.evaluation.metrics import PoseMetrics
+    from lp_framework.models.backbones import Standardise
     from lp_framework.models.pair_mean import PairMean
 
     folder, rank = Path(sys.argv[1]), int(sys.argv[2])
@@ -227,6 +228,10 @@ SHARE = """
         mean.update(batch[0], batch[2].nan_to_num(nan=100.0).mean(dim=1))
     result = metrics.compute()
     result = {**result, "mean": mean.compute().item(), "rows": metrics.rows()["pair"].tolist()}
+    layer = Standardise(2).train()
+    for part in torch.arange(24.0).square().view(2, 6, 2):  # each process meets half of each part
+        layer(part[3 * rank : 3 * rank + 3])
+    result["standardised"] = [layer.mean.tolist(), layer.variance.tolist()]
     (folder / f"result_{rank}.json").write_text(json.dumps(result))
     torch.distributed.barrier()
     torch.distributed.destroy_process_group()
@@ -248,6 +253,9 @@ def test_two_processes_give_the_result_of_one_and_count_the_filling_up_once(tmp_
     for rank in (0, 1):
         result = json.loads((tmp_path / f"result_{rank}.json").read_text())
         assert result.pop("mean") == one.compute().item()
+        features = torch.arange(24.0).square().view(12, 2)
+        moments = [features.mean(dim=0).tolist(), features.var(dim=0, unbiased=False).tolist()]
+        np.testing.assert_allclose(result.pop("standardised"), moments, rtol=1e-5)
         assert result.pop("rows") == given[0].sort().values.tolist()
         assert same(result, expected(given))
 

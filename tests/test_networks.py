@@ -14,7 +14,7 @@ from lp_framework import registry, torchvision_ops
 from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world
-from lp_framework.models.backbones import Backbone, EfficientNetLite0, ResNet, freeze
+from lp_framework.models.backbones import Backbone, EfficientNetLite0, ResNet, Standardise, freeze
 from lp_framework.models.embedding import PoseEmbedding
 from lp_framework.models.networks import PoseNetwork
 from lp_framework.models.pose_model import EnergyModel, ScoreModel
@@ -275,3 +275,24 @@ def test_efficientnet_brings_real_weights_without_network(no_network):
 def test_a_misspelt_setting_of_a_model_is_named(name):
     with pytest.raises(UserError, match="did you mean 'periodic'"):
         registry.build("model", {"name": name, "target": "perodic"}, backbone=Colors())
+
+
+# ---------------------------------------------------------------- standardised features
+
+
+def test_standardise_knows_the_mean_and_spread_of_all_it_has_met():
+    features = 3 * torch.randn(1000, 5, generator=torch.Generator().manual_seed(0)) + 7
+    layer = Standardise(5).train()
+    for batch in features.split([1, 299, 130, 570]):
+        layer(batch)
+    torch.testing.assert_close(layer.mean, features.mean(dim=0))
+    torch.testing.assert_close(layer.variance, features.var(dim=0, unbiased=False))
+    spread = layer.eval()(features).std(dim=0)
+    assert ((spread > 0.9) & (spread < 1)).all()
+
+
+def test_standardise_does_not_use_the_batchs_own_statistics():
+    layer = Standardise(3).train()
+    layer(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)))
+    one_object = torch.full((8, 3), 2.0)
+    assert (layer.eval()(one_object) > 1.5).all()  # batch normalisation would give 0

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from lp_framework import registry
 from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
-from lp_framework.data.sources import RenderedData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint, load_model, newest_checkpoint
@@ -36,17 +35,9 @@ def run(config: DictConfig) -> None:
     trainer = Trainer(
         **plain(config.trainer), default_root_dir=folder, logger=False, callbacks=bars, use_distributed_sampler=False
     )
-    data.trainer = trainer
-    data.validation_views = 0  # only training divides the training views
-    split = "train" if config.protocol == "ifusion" else "test"
-    if trainer.is_global_zero:
-        if isinstance(data, RenderedData):
-            data.render()
-        data.data(split)  # makes the cache; other splits may be missing
-    trainer.strategy.barrier("data")
-    evaluation = Evaluation(solver, starts, data.table(split), config.seed)
-    loader = data.evaluation_dataloader(config.protocol, config.seed)
-    trainer.test(evaluation, loader, verbose=False)
+    data.evaluate_on(config.protocol, config.seed)
+    evaluation = Evaluation(solver, starts, config.seed)
+    trainer.test(evaluation, datamodule=data, verbose=False)
     result = {
         **evaluation.result(),
         "protocol": config.protocol,
@@ -58,7 +49,7 @@ def run(config: DictConfig) -> None:
     if not trainer.is_global_zero:
         return
     write_result(folder, result, evaluation.metrics, evaluation.table)
-    pictures = save_pictures(folder / "pictures", evaluation, data.data(split))
+    pictures = save_pictures(folder / "pictures", evaluation, data.data(data.evaluation_split()))
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     names = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
     title = f"{names}, {result['pairs']} pairs ({config.protocol})"

@@ -57,6 +57,7 @@ class PairDataModule(LightningDataModule):
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
         self.validation_views, self.seed = validation_views, seed
         self._extractor: FeatureExtractor | None = None
+        self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._folders: dict[str, list[ObjectViews]] = {}
         self._tables: dict[str, ViewTable] = {}
 
@@ -64,14 +65,13 @@ class PairDataModule(LightningDataModule):
 
     def prepare_data(self) -> None:
         """Make what is missing on disk, in one process: decoded views, cached features."""
-        for split in ("train", "test"):
-            self.data(split)
+        self.data("train" if self._evaluation is None else self.evaluation_split())
 
     def table(self, split: str) -> ViewTable:
-        """All views of a split: "train" and "validation" (both from the training views on disk), or "test"."""
+        """All views of a split: "train" and "validation" divide the training views, "all_train" does not; "test"."""
         if split not in self._tables:
             views = self._on_disk(split)
-            if split != "test" and self.validation_views:
+            if split in ("train", "validation") and self.validation_views:
                 views = [self._validation_split(each, held_out=split == "validation") for each in views]
             self._tables[split] = ViewTable(views)
         return self._tables[split]
@@ -97,6 +97,14 @@ class PairDataModule(LightningDataModule):
         kept = np.sort(order[:count] if held_out else order[count:])
         files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
         return replace(views, files=files, cameras=cameras)
+
+    def evaluate_on(self, protocol: str, seed: int) -> None:
+        """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
+        self._evaluation = protocol, seed
+
+    def evaluation_split(self) -> str:
+        """The split that the protocol of `evaluate_on` takes its pairs from."""
+        return "all_train" if self._evaluation is not None and self._evaluation[0] == "ifusion" else "test"
 
     def cache_features(self, extractor: FeatureExtractor) -> None:
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
@@ -142,9 +150,10 @@ class PairDataModule(LightningDataModule):
             return []
         return self._listed("validation", "ordered", self.batch_pairs)
 
-    def evaluation_dataloader(self, protocol: str, seed: int) -> DataLoader[PairBatch]:
-        """The pairs of an evaluation protocol, with images."""
-        return self._listed("train" if protocol == "ifusion" else "test", protocol, EVALUATION_PAIRS, seed)
+    def test_dataloader(self) -> DataLoader[PairBatch]:
+        """The pairs of the protocol that `evaluate_on` has set, by default all ordered pairs of the test views."""
+        protocol, seed = self._evaluation or ("ordered", 0)
+        return self._listed(self.evaluation_split(), protocol, EVALUATION_PAIRS, seed)
 
     def _listed(self, split: str, protocol: str, batch_pairs: int, seed: int = 0) -> DataLoader[PairBatch]:
         data = self.data(split)

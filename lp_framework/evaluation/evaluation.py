@@ -9,6 +9,7 @@ from lightning import LightningModule
 from torch import Tensor
 from torchmetrics import SumMetric
 
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch, ViewTable
 from lp_framework.evaluation.metrics import PoseMetrics
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, translation_error
@@ -17,18 +18,30 @@ from lp_framework.solvers.starts import Starts
 
 
 class Evaluation(LightningModule):
-    """Runs a solver under `Trainer.test`, so on any number of devices and processes.
+    """Runs a solver under `Trainer.test` with a `PairDataModule`, so on any number of devices and processes.
 
     Afterwards `result` gives the metrics (see `PoseMetrics`), `metrics.rows()` a row a pair.
     """
 
-    def __init__(self, solver: Solver, starts: Starts, table: ViewTable, seed: int) -> None:
+    table: ViewTable
+    metrics: PoseMetrics
+
+    def __init__(self, solver: Solver, starts: Starts, seed: int) -> None:
         super().__init__()
-        self.solver, self.starts, self.table, self.seed = solver, starts, table, seed
+        self.solver, self.starts, self.seed = solver, starts, seed
         # Registered, so that Lightning moves the networks of the solver to the device.
         self.networks = torch.nn.ModuleList(part for part in vars(solver).values() if isinstance(part, torch.nn.Module))
-        self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer)
         self.solved, self.seconds, self.passes = SumMetric(), SumMetric(), SumMetric()
+
+    def setup(self, stage: str) -> None:
+        """The objects are known once the data are prepared."""
+        data: PairDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        self.gather_for(data.table(data.evaluation_split()))
+
+    def gather_for(self, table: ViewTable) -> None:
+        """Start with no results, for pairs of the views in `table`."""
+        self.table = table
+        self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer)
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:
         assert batch.images is not None  # evaluation never caches features

@@ -10,7 +10,7 @@ import hashlib
 import warnings
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 from torch.nn import functional
 
 from lp_framework import torchvision_ops
@@ -84,7 +84,7 @@ class Standardise(nn.Module):
         self.register_buffer("variance", torch.zeros(dim))
 
     def forward(self, features: Tensor) -> Tensor:
-        """`[I, dim]` to `[I, dim]`; in training the statistics take the batch in first (Chan et al. 1983)."""
+        """`[I, dim]` to `[I, dim]`; in training the statistics take the batch in first."""
         if self.training:
             self._take_in(features.detach().float())
         spread = self.variance.sqrt()
@@ -92,13 +92,18 @@ class Standardise(nn.Module):
 
     @torch.no_grad()
     def _take_in(self, features: Tensor) -> None:
-        added = features.shape[0]
-        share = added / (self.count + added)
-        offset = features.mean(dim=0) - self.mean
-        variance = features.var(dim=0, unbiased=False)
-        self.variance += share * (variance - self.variance + (1 - share) * offset.square())
+        added = features.new_tensor([features.shape[0]])
+        total, squares = features.sum(dim=0), (features - self.mean).square().sum(dim=0)
+        if distributed.is_available() and distributed.is_initialized():  # all processes keep the same statistics
+            for value in (added, total, squares):
+                distributed.all_reduce(value)
+        count = self.count + added.squeeze()
+        offset = total / added - self.mean  # of the new mean from the old one
+        share = added / count
+        self.variance += share * (squares / added - self.variance) - (share * offset).square()
+        self.variance.clamp_(min=0)
         self.mean += share * offset
-        self.count += added
+        self.count.copy_(count)
 
 
 def freeze(module: nn.Module) -> None:

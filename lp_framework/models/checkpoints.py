@@ -74,7 +74,10 @@ def load_model(path: str | Path) -> PoseModel:
     checkpoint = read_checkpoint(file)
     recipe = checkpoint[RECIPE]
     try:
-        backbone = registry.build("backbone", recipe["backbone"])
+        settings = dict(recipe["backbone"])
+        if settings.get("pretrained") and not settings.get("frozen"):
+            settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
+        backbone = registry.build("backbone", settings)
         model = registry.build("model", recipe["model"], backbone=backbone)
         model.on_load_checkpoint(checkpoint)
     except UserError as error:
