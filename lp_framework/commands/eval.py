@@ -51,9 +51,10 @@ def run(config: DictConfig) -> None:
     write_result(folder, result, evaluation.metrics, evaluation.table)
     pictures = save_pictures(folder / "pictures", evaluation, data.data(data.evaluation_split()))
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
-    names = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
-    title = f"{names}, {result['pairs']} pairs ({config.protocol})"
+    choices = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
+    title = f"{choices}, {result['pairs']} pairs ({config.protocol})"
     console.print(terminal_table(title, summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)
-    console.print(f"pictures: {', '.join(str(picture) for picture in pictures)}", soft_wrap=True)
+    names = ", ".join(picture.name for picture in pictures)
+    console.print(f"pictures: {folder / 'pictures'} ({names})", soft_wrap=True)

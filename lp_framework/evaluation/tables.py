@@ -87,7 +87,9 @@ def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, 
     rows = [*summary_rows(result), *((name, row) for name, row in result["per_object"].items() if row is not None)]
     keys = [*COLUMNS, *ERRORS]
     write_csv(
-        folder / "results.csv", ["name", *keys], [[name.strip(), *(row[key] for key in keys)] for name, row in rows]
+        folder / "results.csv",
+        ["name", *keys],
+        [[name.strip(), *(round(row[key], 5) for key in keys)] for name, row in rows],
     )
     write_csv(folder / "pairs.csv", PAIR_COLUMNS, pair_rows(metrics, table))
 
