@@ -13,10 +13,16 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from hydra.core.hydra_config import HydraConfig
+from lightning import Trainer, seed_everything
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from lp_framework import registry
+from lp_framework.composition import one_line
 from lp_framework.data.module import PairDataModule
+from lp_framework.errors import UserError
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +66,30 @@ def build_data(config: DictConfig) -> PairDataModule:
         renderer = registry.build("renderer", config.renderer)
     data: PairDataModule = registry.build("data", config.data, renderer=renderer)
     return data
+
+
+def seed_run(seed: object) -> None:
+    """Seed the global random state, from which weights are initialised."""
+    if not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise UserError(f"seed must be a whole number between 0 and 2^32 - 1, got {seed}")
+    seed_everything(seed, verbose=False)
+
+
+def build_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], logger: list[Logger]) -> Trainer:
+    """Lightning's trainer with the settings of `config.trainer`."""
+    epochs = config.trainer.get("max_epochs", 1)
+    if not isinstance(epochs, int) or epochs < 0:
+        raise UserError(f"trainer.max_epochs must be a number of epochs, got {epochs}")
+    try:
+        return Trainer(
+            **plain(config.trainer),
+            default_root_dir=folder,
+            callbacks=callbacks,
+            logger=logger,
+            use_distributed_sampler=False,  # the data module's samplers know the processes
+        )
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        raise UserError(f"trainer: {one_line(error)}") from error
 
 
 def run_folder() -> Path:

@@ -5,13 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lightning import Trainer, seed_everything
-from lightning.pytorch.callbacks import Callback, RichProgressBar
+from lightning.pytorch.callbacks import RichProgressBar
 from omegaconf import DictConfig
 from rich.console import Console
 
 from lp_framework import registry
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
+from lp_framework.commands.building import (
+    build_data,
+    build_trainer,
+    orderly_console,
+    plain,
+    run_folder,
+    seed_run,
+    versions,
+)
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint, load_model, newest_checkpoint
@@ -22,7 +29,7 @@ from lp_framework.viz.pictures import save_pictures
 def run(config: DictConfig) -> None:
     """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder."""
     folder = run_folder()
-    seed_everything(config.seed, verbose=False)
+    seed_run(config.seed)
     components: dict[str, Any] = {}
     checkpoint: Path | None = None
     if "model" in registry.component_names(registry.get("solver", config.solver.name)):
@@ -31,10 +38,7 @@ def run(config: DictConfig) -> None:
     solver = registry.build("solver", config.solver, **components)
     starts = registry.build("start", config.start)
     data = build_data(config)
-    bars: list[Callback] = [RichProgressBar(leave=False)]
-    trainer = Trainer(
-        **plain(config.trainer), default_root_dir=folder, logger=False, callbacks=bars, use_distributed_sampler=False
-    )
+    trainer = build_trainer(config, folder, [RichProgressBar(leave=False)], logger=[])
     data.evaluate_on(config.protocol, config.seed)
     evaluation = Evaluation(solver, starts, config.seed)
     trainer.test(evaluation, datamodule=data, verbose=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from lightning import Trainer, seed_everything
+from lightning import Trainer
 from lightning.pytorch.callbacks import (
     Callback,
     EarlyStopping,
@@ -25,7 +25,15 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lp_framework import registry
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
+from lp_framework.commands.building import (
+    build_data,
+    build_trainer,
+    orderly_console,
+    plain,
+    run_folder,
+    seed_run,
+    versions,
+)
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, RECIPE, KeepRecipe, read_checkpoint
@@ -49,19 +57,13 @@ def run(config: DictConfig) -> None:
         raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
     if checkpoint is not None and is_finished(folder, config, checkpoint):
         raise UserError(f"resume={folder}: has done all of its epochs; trainer.max_epochs=N would prolong it")
-    seed_everything(config.seed, verbose=False)
+    seed_run(config.seed)
     data = build_data(config)
     backbone = registry.build("backbone", config.backbone)
     model = registry.build("model", config.model, backbone=backbone)
     if backbone.frozen:
         data.cache_features(backbone)
-    trainer = Trainer(
-        **plain(config.trainer),
-        default_root_dir=folder,
-        callbacks=callbacks(config, folder, recipe),
-        logger=loggers(config, folder),
-        use_distributed_sampler=False,  # the data module's samplers know the processes
-    )
+    trainer = build_trainer(config, folder, callbacks(config, folder, recipe), loggers(config, folder))
     if trainer.is_global_zero:
         OmegaConf.save(config, folder / "config.yaml")
         if checkpoint is not None:

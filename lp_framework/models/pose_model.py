@@ -45,23 +45,34 @@ class PoseModel(LightningModule):
     def __init__(
         self,
         backbone: Backbone,
-        target: str,
-        noise: str,
-        sigma: float,
-        noise_low: Sequence[float],
-        noise_high: Sequence[float],
-        hidden: int,
-        layers: int,
-        frequencies: int,
-        dropout: float,
-        view_loss: float,
-        optimizer: str,
-        learning_rate: float,
-        weight_decay: float,
-        schedule: str,
-        seed: int,
+        target: Literal["periodic", "line"] = "periodic",
+        noise: Literal["uniform", "gaussian"] = "uniform",
+        sigma: float = 1.0,
+        noise_low: Sequence[float] = LOW,
+        noise_high: Sequence[float] = HIGH,
+        hidden: int = 256,
+        layers: int = 3,
+        frequencies: int = 4,
+        dropout: float = 0.0,
+        view_loss: float = 1.0,
+        optimizer: Literal["adam", "adamw"] = "adamw",
+        learning_rate: float = 2e-3,
+        weight_decay: float = 1e-2,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        seed: int = 0,
     ) -> None:
         super().__init__()
+        for name, value, fits, wanted in (
+            ("hidden", hidden, hidden >= 1, "at least 1"),
+            ("layers", layers, layers >= 0, "at least 0"),
+            ("frequencies", frequencies, frequencies >= 1, "at least 1"),
+            ("dropout", dropout, 0 <= dropout < 1, "in [0, 1)"),
+            ("view_loss", view_loss, view_loss >= 0, "at least 0"),
+            ("learning_rate", learning_rate, learning_rate >= 0, "at least 0"),
+            ("weight_decay", weight_decay, weight_decay >= 0, "at least 0"),
+        ):
+            if not fits:
+                raise UserError(f"model.{name} must be {wanted}, got {value}")
         self.backbone = backbone
         self.kernel = PoseKernel(target, sigma)
         self.noised_pose = NoisedPose(noise, sigma, noise_low, noise_high)
@@ -197,30 +208,6 @@ class ScoreModel(PoseModel):
 
     outputs = 3
 
-    def __init__(
-        self,
-        backbone: Backbone,
-        target: Literal["periodic", "line"] = "periodic",
-        noise: Literal["uniform", "gaussian"] = "uniform",
-        sigma: float = 1.0,
-        noise_low: Sequence[float] = LOW,
-        noise_high: Sequence[float] = HIGH,
-        hidden: int = 256,
-        layers: int = 3,
-        frequencies: int = 4,
-        dropout: float = 0.0,
-        view_loss: float = 1.0,
-        optimizer: Literal["adam", "adamw"] = "adamw",
-        learning_rate: float = 2e-3,
-        weight_decay: float = 1e-2,
-        schedule: Literal["cosine", "constant"] = "cosine",
-        seed: int = 0,
-    ) -> None:
-        super().__init__(
-            backbone, target, noise, sigma, noise_low, noise_high, hidden, layers, frequencies, dropout, view_loss,
-            optimizer, learning_rate, weight_decay, schedule, seed,
-        )  # fmt: skip
-
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue(self.network(condition, pose), None)
 
@@ -235,30 +222,6 @@ class EnergyModel(PoseModel):
     """Energy network trained on its closed-form target (paper, appendix "Energy-based Modeling")."""
 
     outputs = 1
-
-    def __init__(
-        self,
-        backbone: Backbone,
-        target: Literal["periodic", "line"] = "periodic",
-        noise: Literal["uniform", "gaussian"] = "uniform",
-        sigma: float = 1.0,
-        noise_low: Sequence[float] = LOW,
-        noise_high: Sequence[float] = HIGH,
-        hidden: int = 256,
-        layers: int = 3,
-        frequencies: int = 4,
-        dropout: float = 0.0,
-        view_loss: float = 1.0,
-        optimizer: Literal["adam", "adamw"] = "adamw",
-        learning_rate: float = 2e-3,
-        weight_decay: float = 1e-2,
-        schedule: Literal["cosine", "constant"] = "cosine",
-        seed: int = 0,
-    ) -> None:
-        super().__init__(
-            backbone, target, noise, sigma, noise_low, noise_high, hidden, layers, frequencies, dropout, view_loss,
-            optimizer, learning_rate, weight_decay, schedule, seed,
-        )  # fmt: skip
 
     def energy(self, condition: Tensor, pose: Tensor) -> Tensor:
         """-log p(pose | pair) up to a constant, `[...]`."""
