@@ -18,7 +18,6 @@ A `conf/` folder beside a module of a plugin (inside it, if it is a package) is 
 
 from __future__ import annotations
 
-import ast
 import importlib
 import importlib.metadata
 import importlib.util
@@ -31,54 +30,24 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lp_framework.errors import UserError, nearest
+from lp_framework.registry_sources import BUILT_IN, GROUPS, PACKAGE, Argument, Entry, Key, built_ins, first_line
 
-GROUPS = ("model", "backbone", "prior", "solver", "start", "data", "renderer")
 ENTRY_POINTS = "lp_framework.plugins"
-BUILT_IN = "built-in"
-PACKAGE = "lp_framework"
 MISSING = "???"  # OmegaConf's mark of a value that has to be given
 
 _Class = TypeVar("_Class", bound=type)
-_Key = tuple[str, str]  # group, name
-
-
-@dataclass(frozen=True)
-class Argument:
-    """One argument of a constructor, as text; `default` is None where a value has to be given."""
-
-    name: str
-    annotation: str
-    default: str | None
-
-    def __str__(self) -> str:
-        return self.name if self.default is None else f"{self.name}={self.default}"
-
-
-@dataclass(frozen=True)
-class Entry:
-    """What is known of a registered class without using it."""
-
-    group: str
-    name: str
-    module: str
-    qualname: str
-    origin: str
-    summary: str
-    settings: tuple[Argument, ...]
-    components: tuple[Argument, ...]
 
 
 @dataclass
 class _State:
     """What has been found so far."""
 
-    classes: dict[_Key, type]
-    origins: dict[_Key, str]
+    classes: dict[Key, type]
+    origins: dict[Key, str]
     failures: dict[str, str]
     conf_folders: list[Path]
     seen: set[str]  # plugins already tried, by folder or entry point
@@ -119,7 +88,7 @@ def _owner(group: str, name: str, scan: bool) -> tuple[str, str, str] | None:
     """Module, class and origin that have the name already; `scan` looks among built-ins not yet imported, too."""
     if cls := _state.classes.get((group, name)):
         return cls.__module__, cls.__qualname__, _state.origins[group, name]
-    entry = _built_ins().get((group, name)) if scan else None
+    entry = built_ins().get((group, name)) if scan else None
     return (entry.module, entry.qualname, entry.origin) if entry else None
 
 
@@ -134,7 +103,7 @@ def names(group: str) -> list[str]:
     """
     _check_group(group)
     discover()
-    return sorted(name for found, name in {*_built_ins(), *_state.classes} if found == group)
+    return sorted(name for found, name in {*built_ins(), *_state.classes} if found == group)
 
 
 def entries(group: str | None = None) -> list[Entry]:
@@ -149,7 +118,7 @@ def get(group: str, name: str) -> type:
     if name not in known:
         raise UserError(f"there is no {group} '{name}'{nearest(name, known)} (known: {', '.join(known) or 'none'})")
     if (group, name) not in _state.classes:
-        entry = _built_ins()[group, name]
+        entry = built_ins()[group, name]
         try:
             module = importlib.import_module(entry.module)
         except ModuleNotFoundError as error:
@@ -407,7 +376,7 @@ def _check_group(group: str) -> None:
 
 
 def _entry(group: str, name: str) -> Entry:
-    built_in = _built_ins().get((group, name))
+    built_in = built_ins().get((group, name))
     if built_in is not None:
         return built_in
     cls = _state.classes[group, name]
@@ -418,7 +387,7 @@ def _entry(group: str, name: str) -> Entry:
         cls.__module__,
         cls.__qualname__,
         _state.origins[group, name],
-        _first_line(cls.__doc__),
+        first_line(cls.__doc__),
         tuple(map(_argument, settings.values())),
         tuple(map(_argument, components.values())),
     )
@@ -428,118 +397,3 @@ def _argument(parameter: inspect.Parameter) -> Argument:
     empty = inspect.Parameter.empty
     annotation = "" if parameter.annotation is empty else inspect.formatannotation(parameter.annotation).strip("'")
     return Argument(parameter.name, annotation, None if parameter.default is empty else repr(parameter.default))
-
-
-def _first_line(docstring: str | None) -> str:
-    return (docstring or "").strip().partition("\n")[0]
-
-
-# ---------------------------------------------------------------- reading the sources of the built-ins
-
-
-@cache
-def _built_ins() -> dict[_Key, Entry]:
-    """The classes of this package that are decorated with `@register("group", "name")`, found without importing."""
-    found: dict[_Key, Entry] = {}
-    for file in sorted(Path(__file__).parent.rglob("*.py")):
-        text = file.read_text(encoding="utf-8")
-        if file == Path(__file__) or "register(" not in text:
-            continue
-        for node in _tree(file).body:
-            for key in _registrations(node):
-                if key in found:
-                    raise UserError(f"{key[0]} '{key[1]}' is registered twice: in {found[key].module} and in {file}")
-                found[key] = _describe(key, file, typing.cast(ast.ClassDef, node))
-    return found
-
-
-@cache
-def _tree(file: Path) -> ast.Module:
-    return ast.parse(file.read_text(encoding="utf-8"), str(file))
-
-
-def _registrations(node: ast.stmt) -> Iterator[_Key]:
-    """The (group, name) pairs of the `register` decorators on a class."""
-    for decorator in node.decorator_list if isinstance(node, ast.ClassDef) else ():
-        match decorator:
-            case ast.Call(
-                func=ast.Name(id="register") | ast.Attribute(attr="register"),
-                args=[ast.Constant(value=str(group)), ast.Constant(value=str(name))],
-            ):
-                yield group, name
-
-
-def _describe(key: _Key, file: Path, node: ast.ClassDef) -> Entry:
-    arguments = _constructor(file, node)
-    return Entry(
-        *key,
-        _module_name(file),
-        node.name,
-        BUILT_IN,
-        _first_line(ast.get_docstring(node)),
-        tuple(each for each in arguments if each.name not in GROUPS),
-        tuple(each for each in arguments if each.name in GROUPS),
-    )
-
-
-def _module_name(file: Path) -> str:
-    parts = file.relative_to(Path(__file__).parents[1]).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-def _constructor(file: Path, node: ast.ClassDef) -> list[Argument]:
-    """The arguments of a class's `__init__`, its own or that of the first base class in this package that has one."""
-    for statement in node.body:
-        if isinstance(statement, ast.FunctionDef) and statement.name == "__init__":
-            return _signature(file, statement.args)
-    for base in node.bases:
-        found = _class_named(file, base.id) if isinstance(base, ast.Name) else None
-        if found and (arguments := _constructor(*found)):
-            return arguments
-    return []
-
-
-def _class_named(file: Path, name: str) -> tuple[Path, ast.ClassDef] | None:
-    """The class that a name means at the top level of a source file, followed through imports from this package."""
-    for statement in _tree(file).body:
-        if isinstance(statement, ast.ClassDef) and statement.name == name:
-            return file, statement
-        if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(f"{PACKAGE}."):
-            for alias in statement.names:
-                if (alias.asname or alias.name) == name:
-                    source = Path(__file__).parents[1].joinpath(*statement.module.split("."))  # type: ignore[union-attr]
-                    for candidate in (source.with_suffix(".py"), source / "__init__.py"):
-                        if candidate.exists():
-                            return _class_named(candidate, alias.name)
-    return None
-
-
-def _signature(file: Path, arguments: ast.arguments) -> list[Argument]:
-    positional = [*arguments.posonlyargs, *arguments.args]
-    defaults = [*[None] * (len(positional) - len(arguments.defaults)), *arguments.defaults]
-    pairs = [*zip(positional, defaults, strict=True), *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)]
-    return [
-        Argument(
-            each.arg,
-            ast.unparse(each.annotation).strip("'") if each.annotation else "",
-            None if default is None else ast.unparse(_value(file, default)),
-        )
-        for each, default in pairs[1:]  # without self
-    ]
-
-
-def _value(file: Path, default: ast.expr) -> ast.expr:
-    """The default itself, or the value of the constant that it names: of `A = 1` or `A, B = 1, 2` in the same file."""
-    for statement in _tree(file).body:
-        match statement:
-            case ast.Assign(targets=[ast.Name(id=name)], value=value):
-                constants = {name: value}
-            case ast.Assign(targets=[ast.Tuple(elts=names)], value=ast.Tuple(elts=values)):
-                constants = {
-                    each.id: value for each, value in zip(names, values, strict=False) if isinstance(each, ast.Name)
-                }
-            case _:
-                continue
-        if isinstance(default, ast.Name) and default.id in constants:
-            return constants[default.id]
-    return default

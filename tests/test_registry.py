@@ -12,7 +12,7 @@ from typing import Literal
 import pytest
 from omegaconf import OmegaConf
 
-from lp_framework import registry
+from lp_framework import registry, registry_sources
 from lp_framework.composition import node
 from lp_framework.errors import UserError
 from lp_framework.registry import build, entries, get, names, register
@@ -159,8 +159,8 @@ def test_a_built_in_name_is_taken_even_before_its_module_is_imported():
 def test_a_missing_package_is_named_with_what_installs_it(tmp_path, monkeypatch):
     (tmp_path / "tmp_needy.py").write_text("import diffusers_of_another_kind")
     entry = registry.Entry("prior", "tmp_needy", "tmp_needy", "Needy", registry.BUILT_IN, "", (), ())
-    built_ins = {**registry._built_ins(), ("prior", "tmp_needy"): entry}
-    monkeypatch.setattr(registry, "_built_ins", lambda: built_ins)
+    built_ins = {**registry.built_ins(), ("prior", "tmp_needy"): entry}
+    monkeypatch.setattr(registry, "built_ins", lambda: built_ins)
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(UserError, match="needs the Python package 'diffusers_of_another_kind', which is not installed"):
         get("prior", "tmp_needy")
@@ -190,7 +190,7 @@ def test_every_built_in_has_a_config_of_its_settings(group, name):
 def test_the_value_of_a_default_that_is_a_constant_is_read(tmp_path):
     source = "A, B = 1, (2, 3)\nC = 'c'\nclass X:\n    def __init__(self, a=A, *, b=B, c=C, d=D, e=4): pass\n"
     (tmp_path / "x.py").write_text(source)
-    arguments = registry._constructor(tmp_path / "x.py", registry._tree(tmp_path / "x.py").body[-1])
+    arguments = registry_sources._constructor(tmp_path / "x.py", registry_sources._tree(tmp_path / "x.py").body[-1])
     assert list(map(str, arguments)) == ["a=1", "b=(2, 3)", "c='c'", "d=D", "e=4"]
 
 

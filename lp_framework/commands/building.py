@@ -93,10 +93,10 @@ def build_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], l
 
 
 def run_folder() -> Path:
-    """The folder of this run, made if need be."""
+    """The folder of this run, made if need be; relative to the working directory where it lies below it."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    return folder
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
