@@ -36,6 +36,20 @@ from typing import Any, TypeVar
 from lp_framework.errors import UserError, nearest
 from lp_framework.registry_sources import BUILT_IN, GROUPS, PACKAGE, Argument, Entry, Key, built_ins, first_line
 
+__all__ = [
+    "GROUPS",
+    "build",
+    "component_names",
+    "conf_folders",
+    "discover",
+    "entries",
+    "failures",
+    "get",
+    "names",
+    "plugin_folders",
+    "register",
+]
+
 ENTRY_POINTS = "lp_framework.plugins"
 MISSING = "???"  # OmegaConf's mark of a value that has to be given
 
