@@ -38,13 +38,14 @@ class _Watch(importlib.abc.MetaPathFinder):
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
         if fullname == "torchvision":
-            sys.meta_path.remove(self)
             ensure()
         return None
 
 
 def ensure() -> None:
     """Call it before the first `import torchvision`; where torchvision is healthy it changes nothing."""
+    # Looking for torchvision is what the watch waits for: it must not call this again from within.
+    sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _Watch)]
     if "torchvision" in sys.modules or _declared or _extension_loads():
         return
     import torch

@@ -121,7 +121,7 @@ def test_the_table_has_the_papers_layout_and_the_last_lines_name_the_files(evalu
     table = evaluated.out[evaluated.out.index("renderings, langevin") :]
     for label in ("@5", "@15", "@30", "R(R)", "SR(R)", "Rot.", "Trans.", "all objects", "unique answer", "continuous"):
         assert label in table
-    assert f"results:  {evaluated.folder / 'results.json'}" in evaluated.out.splitlines()
+    assert f"results:  {evaluated.folder.name}/results.json" in evaluated.out.splitlines()
     assert evaluated.err == ""
     with (evaluated.folder / "results.csv").open() as file:
         names = [row["name"] for row in csv.DictReader(file)]

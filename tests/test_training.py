@@ -94,8 +94,9 @@ def test_a_run_leaves_checkpoints_config_metrics_and_its_log(score):
 
 def test_the_console_ends_with_the_model_and_the_next_command(score):
     lines = [" ".join(line.split()) for line in score.out.splitlines()]
-    assert f"model: {score.folder / 'checkpoints' / 'best.ckpt'}" in lines
-    assert lines[-1] == f"next: python -m lp_framework eval checkpoint={score.folder}"
+    # Relative to the working directory, in which the runs of these tests lie.
+    assert f"model: {score.folder.name}/checkpoints/best.ckpt" in lines
+    assert lines[-1] == f"next: python -m lp_framework eval checkpoint={score.folder.name}"
 
 
 def test_the_console_has_no_notes_and_advertisements(score, commands):
