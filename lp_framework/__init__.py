@@ -16,10 +16,11 @@ from lp_framework import torchvision_ops
 
 if TYPE_CHECKING:
     from lp_framework.models.pose_model import PoseModel
+    from lp_framework.priors.base import Prior
     from lp_framework.solvers.base import Solver
     from lp_framework.solvers.starts import Starts
 
-__all__ = ["load_model", "load_solver", "make_starts"]
+__all__ = ["load_model", "load_prior", "load_solver", "make_starts"]
 
 torchvision_ops.install()
 
@@ -31,11 +32,19 @@ def load_model(checkpoint: str | Path) -> PoseModel:
     return load(checkpoint)
 
 
-def load_solver(name: str, model: PoseModel | None = None, **arguments: Any) -> Solver:
-    """A solver by its registered name, with the model that it asks for and its settings."""
+def load_prior(name: str, **arguments: Any) -> Prior:
+    """A pose-conditioned diffusion prior by its registered name, frozen."""
     from lp_framework import registry
 
-    solver: Solver = registry.build("solver", {"name": name, **arguments}, model=model)
+    prior: Prior = registry.build("prior", {"name": name, **arguments})
+    return prior
+
+
+def load_solver(name: str, model: PoseModel | None = None, prior: Prior | None = None, **arguments: Any) -> Solver:
+    """A solver by its registered name, with the model and the prior that it asks for and its settings."""
+    from lp_framework import registry
+
+    solver: Solver = registry.build("solver", {"name": name, **arguments}, model=model, prior=prior)
     return solver
 
 

@@ -15,6 +15,7 @@ COMMANDS = {  # the module of a command is lp_framework.commands.NAME
     "train": "Train a score or energy model of the relative pose",
     "eval": "Estimate the poses of a data set's test views and report recall, success rate and errors",
     "render": "Render meshes to views on disk",
+    "convert": "Turn a published Zero123 checkpoint into a folder of safetensors that loads in seconds",
     "bench": "Measure how many pairs a second the data loaders deliver, and their memory",
     "plugins": "List every model, prior, solver, ... with its origin and its settings",
 }

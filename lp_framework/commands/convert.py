@@ -1,0 +1,27 @@
+"""`convert`: an original Zero123 checkpoint to a folder in diffusers' layout, as safetensors."""
+
+from __future__ import annotations
+
+import typing
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from lp_framework.errors import UserError, nearest
+from lp_framework.priors.zero123.folders import write_folder
+from lp_framework.priors.zero123.networks import Dtype
+from lp_framework.priors.zero123.original import Averages
+from lp_framework.priors.zero123.weights import load_networks
+
+
+def run(config: DictConfig) -> None:
+    """Read `path` (with `weights` and `dtype`) and write the folder `output`, which `prior.path` then takes."""
+    for key, known in (("weights", typing.get_args(Averages)), ("dtype", typing.get_args(Dtype))):
+        if config[key] not in known:
+            choices = f"{nearest(str(config[key]), known)} (known: {', '.join(known)})"
+            raise UserError(f"{key}={config[key]} is none of its values{choices}")
+    output = Path(config.output)
+    if output.exists():
+        raise UserError(f"output={output}: exists already; give another folder or remove it")
+    write_folder(load_networks(config.path, config.revision, config.weights, config.dtype), output)
+    print(f"converted: {output} (use it with prior.path={output})")

@@ -1,0 +1,96 @@
+"""The prior interface: a frozen, pose-conditioned diffusion model whose denoising error is an energy over poses."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from lp_framework.errors import UserError
+
+
+@dataclass(frozen=True)
+class ViewCode:
+    """All that a prior keeps of B images: `latent` `[B, C, h, w]` and `embedding` `[B, tokens, channels]`.
+
+    Indexing is that of a batch: `code[2:5]`, `code[index]` with integers `[N]` of images, repeated ones too.
+    """
+
+    latent: Tensor
+    embedding: Tensor
+
+    def __len__(self) -> int:
+        return len(self.latent)
+
+    def __getitem__(self, index: slice | Tensor) -> ViewCode:
+        return ViewCode(self.latent[index], self.embedding[index])
+
+    def to(self, device: torch.device | str) -> ViewCode:
+        """The same on another device."""
+        return ViewCode(self.latent.to(device), self.embedding.to(device))
+
+
+class Prior(nn.Module, ABC):
+    """A frozen pose-conditioned diffusion model. A subclass sets the attributes and says what the network predicts.
+
+    Relative poses are `query - reference`, `(latitude, longitude, radius)` in radians and scene units, `[B, 3]`.
+    """
+
+    num_timesteps: int  # timesteps are integers from 0 (hardly any noise) to num_timesteps - 1
+    latent_shape: tuple[int, int, int]  # of an image's latent, and so of the noise
+    image_size: int  # pixels a side of the images that the prior sees and generates
+
+    @abstractmethod
+    def encode(self, images: Tensor) -> ViewCode:
+        """The code of images `[B, 3, H, W]` in [-1, 1] on white, resized where need be; once an image is enough."""
+
+    @abstractmethod
+    def residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
+        """Predicted minus true noise, `[B, *latent_shape]` float32; differentiable in `pose`, forward and backward.
+
+        The prediction is for `target` (B codes) noised by `noise` `[B, *latent_shape]` to `timestep` `[B]` (int64),
+        seen from `source` (B codes) under the relative pose `[B, 3]` of the target.
+        """
+
+    def denoising_error(
+        self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor
+    ) -> Tensor:
+        """The mean square of `residual`, `[B]`: the energy of each pose, differentiable in it."""
+        return self.residual(target, source, pose, timestep, noise).square().flatten(1).mean(dim=1)
+
+    @abstractmethod
+    def generate(
+        self,
+        source: ViewCode,
+        pose: Tensor,
+        steps: int = 50,
+        guidance: float = 3.0,
+        generator: torch.Generator | None = None,
+        eta: float = 1.0,
+    ) -> Tensor:
+        """Novel views `[B, 3, image_size, image_size]` in [-1, 1] of `source` under relative poses `[B, 3]`, by DDIM.
+
+        `guidance` is the scale of classifier-free guidance (1: none), `eta` the share of fresh noise (0: none).
+        """
+
+    def train(self, mode: bool = True) -> Prior:
+        """As every module, but a prior stays in evaluation mode."""
+        return super().train(False)
+
+    def check(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> None:
+        """`UserError` where the arguments of `residual` do not fit each other."""
+        batch = len(pose)
+        wanted = {
+            "target": (tuple(target.latent.shape), (batch, *self.latent_shape)),
+            "source": (tuple(source.latent.shape), (batch, *self.latent_shape)),
+            "pose": (tuple(pose.shape), (batch, 3)),
+            "timestep": (tuple(timestep.shape), (batch,)),
+            "noise": (tuple(noise.shape), (batch, *self.latent_shape)),
+        }
+        for name, (shape, right) in wanted.items():
+            if shape != right:
+                raise UserError(f"{name} must be {list(right)} for {batch} poses, got {list(shape)}")
+        if timestep.is_floating_point() or (batch and not 0 <= timestep.min() <= timestep.max() < self.num_timesteps):
+            raise UserError(f"timestep must hold integers from 0 to {self.num_timesteps - 1}, got {timestep.tolist()}")

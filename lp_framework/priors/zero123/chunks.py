@@ -1,0 +1,74 @@
+"""A batch through the U-Net in pieces that fit into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+_Result = TypeVar("_Result")
+
+
+class Chunks:
+    """Runs a function on slices of a batch, at most `size` long (None: all of it).
+
+    When a GPU runs out of memory the size is halved for good and the rest of the batch tried again.
+    """
+
+    def __init__(self, size: int | None) -> None:
+        self.size = size
+
+    def run(self, function: Callable[[slice], _Result], batch: int) -> list[_Result]:
+        """The results for `slice(0, size)`, `slice(size, 2 * size)`, ... of a batch."""
+        results: list[_Result] = []
+        start = 0
+        while start < batch:
+            stop = min(start + (self.size or batch), batch)
+            try:
+                results.append(function(slice(start, stop)))
+            except torch.cuda.OutOfMemoryError:
+                if stop - start == 1:
+                    raise
+                self.size = (stop - start) // 2
+            else:
+                start = stop
+                continue
+            torch.cuda.empty_cache()  # here the exception, and with it the tensors of the failed attempt, are gone
+        return results
+
+
+class EnergyAndSlope(torch.autograd.Function):
+    """Energies `[B]` of poses `[B, 3]` whose gradient is computed at once, chunk by chunk.
+
+    Each energy depends on its own pose alone, so its gradient is a row `[3]`, kept in the place of the network's
+    activations. Differentiable once; for more use the residual.
+    """
+
+    @staticmethod
+    def forward(pose: Tensor, energy: Callable[[slice, Tensor], Tensor], chunks: Chunks) -> tuple[Tensor, Tensor]:
+        """Energies and their gradients."""
+
+        def both(part: slice) -> tuple[Tensor, Tensor]:
+            with torch.enable_grad():
+                poses = pose[part].detach().requires_grad_()
+                energies = energy(part, poses)
+                (slope,) = torch.autograd.grad(energies.sum(), poses)
+            return energies.detach(), slope
+
+        energies, slopes = zip(*chunks.run(both, len(pose)), strict=True)
+        return torch.cat(energies), torch.cat(slopes)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        """Keeps the gradients."""
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, None, None]:
+        """The chain rule, a row each."""
+        (slopes,) = ctx.saved_tensors
+        return grad[:, None] * slopes, None, None

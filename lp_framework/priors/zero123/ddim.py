@@ -1,0 +1,39 @@
+"""DDIM (Song, Meng and Ermon 2021) over the 1000 steps of a trained diffusion model.
+
+Symbols: `alpha` is the paper's alpha_t (Ho et al.'s alpha-bar_t), `latent` its x_t, `noise` its epsilon_theta(x_t).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lp_framework.errors import UserError
+
+STEPS_OFFSET = 1  # latent-diffusion's sampler visits 1, 21, 41, ... instead of 0, 20, 40, ...
+
+
+def scaled_linear_alphas(num_timesteps: int = 1000, start: float = 0.00085, end: float = 0.0120) -> Tensor:
+    """alpha_t `[num_timesteps]` of latent-diffusion's schedule: the square root of beta_t is linear in t."""
+    betas = torch.linspace(start**0.5, end**0.5, num_timesteps, dtype=torch.float64) ** 2
+    return (1 - betas).cumprod(dim=0).float()
+
+
+def ddim_timesteps(steps: int, num_timesteps: int = 1000) -> list[int]:
+    """The timesteps visited, from noise to image.
+
+    >>> ddim_timesteps(5)
+    [801, 601, 401, 201, 1]
+    """
+    if not 1 <= steps <= num_timesteps:
+        raise UserError(f"steps must lie between 1 and {num_timesteps}, got {steps}")
+    stride = num_timesteps // steps
+    return [min(step * stride + STEPS_OFFSET, num_timesteps - 1) for step in reversed(range(steps))]
+
+
+def ddim_step(latent: Tensor, noise: Tensor, alpha: Tensor, alpha_next: Tensor, eta: float, fresh: Tensor) -> Tensor:
+    """The latent one step nearer to the image (Eq. 12); `fresh` is standard normal noise, its share `eta` (Eq. 16)."""
+    sigma = eta * ((1 - alpha_next) / (1 - alpha) * (1 - alpha / alpha_next)).sqrt()
+    image = (latent - (1 - alpha).sqrt() * noise) / alpha.sqrt()  # "predicted x_0"
+    direction = (1 - alpha_next - sigma.square()).sqrt() * noise  # "direction pointing to x_t"
+    return alpha_next.sqrt() * image + direction + sigma * fresh

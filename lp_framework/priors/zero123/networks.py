@@ -1,0 +1,144 @@
+"""Zero123's four networks: diffusers' U-Net and autoencoder, transformers' CLIP image encoder, the pose projection."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from lp_framework.errors import UserError
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+Dtype = Literal["float32", "bfloat16", "float16"]
+
+# Configs in the words of diffusers' and transformers' config.json, and the tensors of each network by their names.
+Configs = Mapping[str, Mapping[str, Any]]
+Weights = Mapping[str, Mapping[str, Callable[[], Tensor]]]  # part -> name -> maps that tensor
+
+POSE_CHANNELS = 4  # of the conditioning vector T
+
+
+def unet_config(
+    channels: list[int], layers: int, attention: list[bool], heads: int, context: int, latent: int = 4
+) -> dict[str, Any]:
+    """Config of the U-Net: channels and whether there is attention, a level each from fine to coarse."""
+    return {
+        "sample_size": 32,
+        "in_channels": 2 * latent,  # the noised target and the source
+        "out_channels": latent,
+        "block_out_channels": channels,
+        "layers_per_block": layers,
+        "down_block_types": ["CrossAttnDownBlock2D" if each else "DownBlock2D" for each in attention],
+        "up_block_types": ["CrossAttnUpBlock2D" if each else "UpBlock2D" for each in reversed(attention)],
+        "attention_head_dim": heads,  # sic: diffusers calls the number of heads so
+        "cross_attention_dim": context,
+    }
+
+
+def vae_config(channels: list[int], layers: int, latent: int = 4) -> dict[str, Any]:
+    """Config of the autoencoder: channels of each level, from fine to coarse."""
+    return {
+        "in_channels": 3,
+        "out_channels": 3,
+        "block_out_channels": channels,
+        "layers_per_block": layers,
+        "down_block_types": ["DownEncoderBlock2D"] * len(channels),
+        "up_block_types": ["UpDecoderBlock2D"] * len(channels),
+        "latent_channels": latent,
+        "sample_size": 256,
+        "scaling_factor": 0.18215,
+    }
+
+
+def clip_config(width: int, layers: int, patch: int, image_size: int, projection: int) -> dict[str, Any]:
+    """Config of OpenAI's CLIP vision transformer; its heads are 64 wide."""
+    return {
+        "hidden_size": width,
+        "intermediate_size": 4 * width,
+        "num_hidden_layers": layers,
+        "num_attention_heads": width // 64,
+        "patch_size": patch,
+        "image_size": image_size,
+        "projection_dim": projection,
+        "hidden_act": "quick_gelu",
+        "layer_norm_eps": 1e-5,
+    }
+
+
+PUBLISHED: Configs = {  # the sizes of Zero123 and Zero123-XL: Stable Diffusion 1's, with CLIP ViT-L/14
+    "unet": unet_config([320, 640, 1280, 1280], 2, [True, True, True, False], heads=8, context=768),
+    "vae": vae_config([128, 256, 512, 512], 2),
+    "image_encoder": clip_config(width=1024, layers=24, patch=14, image_size=224, projection=768),
+}
+
+
+def require_packages() -> None:
+    """`UserError` naming a package of the extra `zero123` that is not installed."""
+    for package in ("diffusers", "transformers", "huggingface_hub"):
+        if importlib.util.find_spec(package) is None:
+            raise UserError(
+                f"Zero123 needs the Python package '{package}', which is not installed: "
+                "pip install 'lp_framework[zero123]'"
+            )
+
+
+class Networks(nn.Module):
+    """The four networks, with random weights."""
+
+    def __init__(self, configs: Configs) -> None:
+        super().__init__()
+        require_packages()
+        from diffusers import AutoencoderKL, UNet2DConditionModel
+        from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+        self.unet = UNet2DConditionModel.from_config(dict(configs["unet"]))
+        self.vae = AutoencoderKL.from_config(dict(configs["vae"]))
+        self.image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig.from_dict(dict(configs["image_encoder"])))
+        embedding = self.image_encoder.config.projection_dim
+        self.cc_projection = nn.Linear(embedding + POSE_CHANNELS, self.unet.config.cross_attention_dim)
+
+
+def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> Networks:
+    """The networks with these weights: built without memory, then given one tensor after another.
+
+    `origin` names the weights in errors. Raises `UserError` for missing, unknown and misshapen tensors.
+    """
+    try:
+        with torch.device("meta"):
+            networks = Networks(configs)
+    except (TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
+        raise UserError(
+            f"{origin}: its sizes are not those of Zero123's networks: {str(error).partition(chr(10))[0]}"
+        ) from error
+    _restore_buffers(networks)
+    for part, network in networks.named_children():
+        single = part == "cc_projection"  # small, and what poses pass through
+        _load(f"{origin}, {part}", network, weights[part], torch.float32 if single else DTYPES[dtype])
+    return networks
+
+
+def _load(origin: str, network: nn.Module, weights: Mapping[str, Callable[[], Tensor]], dtype: torch.dtype) -> None:
+    expected = network.state_dict()
+    missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
+    if missing or unknown:
+        reasons = [f"{len(names)} {kind} (such as '{names[0]}')" for kind, names in
+                   (("missing", missing), ("unknown", unknown)) if names]  # fmt: skip
+        raise UserError(f"{origin}: its tensors are not those of Zero123: {' and '.join(reasons)}")
+    tensors = {}
+    for name, mapped in weights.items():
+        tensor = mapped()
+        if tensor.shape != expected[name].shape:
+            shapes = f"{list(tensor.shape)} instead of {list(expected[name].shape)}"
+            raise UserError(f"{origin}: '{name}' has the shape {shapes}")
+        tensors[name] = torch.empty(tensor.shape, dtype=dtype).copy_(tensor)  # the file's bytes are let go of
+    network.load_state_dict(tensors, assign=True)
+
+
+def _restore_buffers(networks: Networks) -> None:
+    """What is in no file and has no values on the meta device: the numbers of CLIP's patches."""
+    embeddings = networks.image_encoder.vision_model.embeddings
+    count = embeddings.position_embedding.num_embeddings
+    embeddings.register_buffer("position_ids", torch.arange(count).expand(1, -1), persistent=False)

@@ -1,0 +1,243 @@
+"""Zero123 as an energy over relative poses, and as a generator of novel views."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lp_framework.errors import UserError
+from lp_framework.priors.base import Prior, ViewCode
+from lp_framework.priors.zero123.attention import Attention, choose_attention
+from lp_framework.priors.zero123.chunks import Chunks, EnergyAndSlope
+from lp_framework.priors.zero123.conditioning import conditioning_vector
+from lp_framework.priors.zero123.ddim import ddim_step, ddim_timesteps, scaled_linear_alphas
+from lp_framework.priors.zero123.networks import Dtype, Networks
+from lp_framework.priors.zero123.original import Averages
+from lp_framework.priors.zero123.weights import load_networks
+from lp_framework.registry import register
+
+IMAGE_SIZE = 256  # the sizes in the configs of published folders are those of Stable Diffusion, some of them
+SCALE = 0.18215  # of latents before noise is added; the latent of the source is not scaled
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+
+class Zero123Prior(Prior):
+    """Zero123's four networks, in whatever dtype they are, ready for use; `Zero123` and `Zero123XL` load them.
+
+    Poses, their projection and energies are float32 in any case.
+
+    - `channels_last`, `compile`: memory layout of the U-Net, and `torch.compile` of it (slow at the first call).
+    - `attention`: `sdpa` is PyTorch's fused attention, `math` its plain one, which can be differentiated twice.
+    - `max_batch`: samples that pass a network at once; more are split. On a GPU that runs out of memory it is halved.
+    """
+
+    alphas_cumprod: Tensor
+    clip_mean: Tensor
+    clip_std: Tensor
+
+    def __init__(
+        self,
+        networks: Networks,
+        channels_last: bool = False,
+        compile: bool = False,
+        attention: Attention = "sdpa",
+        max_batch: int | None = None,
+    ) -> None:
+        super().__init__()
+        if max_batch is not None and max_batch < 1:
+            raise UserError(f"prior.max_batch must be at least 1, got {max_batch}")
+        self.unet, self.vae, self.image_encoder = networks.unet, networks.vae, networks.image_encoder
+        self.cc_projection = networks.cc_projection
+        self.cc_projection.float()  # small, and what the pose passes through
+        choose_attention(self.unet, attention)
+        if channels_last:
+            self.unet.to(memory_format=torch.channels_last)
+        if compile:
+            # Inductor's own choice of layouts gives wrong gradients (30% off) on CPUs, seen with PyTorch 2.13.
+            self.unet.compile(options={"layout_optimization": False})
+        self.eval().requires_grad_(False)
+        side = IMAGE_SIZE // 2 ** (len(self.vae.config.block_out_channels) - 1)
+        self.image_size, self.latent_shape = IMAGE_SIZE, (int(self.vae.config.latent_channels), side, side)
+        self.channels_last, self.chunks = channels_last, Chunks(max_batch)
+        alphas = scaled_linear_alphas()
+        self.num_timesteps = len(alphas)
+        self.register_buffer("alphas_cumprod", alphas, persistent=False)
+        self.register_buffer("clip_mean", torch.tensor(CLIP_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("clip_std", torch.tensor(CLIP_STD).view(3, 1, 1), persistent=False)
+
+    # ------------------------------------------------------------ images
+
+    @torch.no_grad()
+    def encode(self, images: Tensor) -> ViewCode:
+        """See `Prior.encode`: the mode of the autoencoder's posterior, unscaled, and CLIP's embedding `[B, 1, 768]`."""
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise UserError(f"images must be [B, 3, H, W], got {list(images.shape)}")
+        size = [self.image_size, self.image_size]
+        if list(images.shape[-2:]) != size:
+            images = functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
+        parts = self.chunks.run(lambda part: (self._latent(images[part]), self._embedding(images[part])), len(images))
+        latents, embeddings = zip(*parts, strict=True)
+        return ViewCode(torch.cat(latents), torch.cat(embeddings))
+
+    def _latent(self, images: Tensor) -> Tensor:
+        return self.vae.encode(images.to(self.vae.dtype)).latent_dist.mode().float()
+
+    def _embedding(self, images: Tensor) -> Tensor:
+        """The published code resizes for CLIP by bicubic interpolation with corners aligned, without antialiasing."""
+        side: Any = self.image_encoder.config.image_size
+        small = functional.interpolate(images.float(), [side, side], mode="bicubic", align_corners=True)
+        pixels = ((small + 1) / 2 - self.clip_mean) / self.clip_std
+        return self.image_encoder(pixel_values=pixels.to(self.image_encoder.dtype)).image_embeds.float()[:, None]
+
+    @torch.no_grad()
+    def decode(self, latent: Tensor) -> Tensor:
+        """Images `[B, 3, image_size, image_size]` (not clipped) of unscaled latents `[B, *latent_shape]`."""
+        parts = self.chunks.run(lambda part: self.vae.decode(latent[part].to(self.vae.dtype)).sample, len(latent))
+        return torch.cat(parts).float()
+
+    # ------------------------------------------------------------ the energy
+
+    def token(self, embedding: Tensor, pose: Tensor) -> Tensor:
+        """The condition `[B, 1, 768]`: the projection of the source's embedding `[B, 1, 768]` and the pose's T."""
+        vector = conditioning_vector(pose).to(embedding.dtype)
+        return self.cc_projection(torch.cat([embedding, vector[:, None]], dim=-1))
+
+    def residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
+        """See `Prior.residual`: epsilon_theta(z_t, t, source, T) - epsilon, with z_t = q(z_t | z_0) of the target."""
+        self.check(target, source, pose, timestep, noise)
+        parts = self.chunks.run(
+            lambda part: self._residual(target[part], source[part], pose[part], timestep[part], noise[part]), len(pose)
+        )
+        return torch.cat(parts)
+
+    def _residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
+        alpha = self.alphas_cumprod[timestep].view(-1, 1, 1, 1)  # alpha-bar_t
+        noisy = alpha.sqrt() * SCALE * target.latent + (1 - alpha).sqrt() * noise  # z_t
+        return self.predict(noisy, source.latent, self.token(source.embedding, pose), timestep) - noise
+
+    def predict(self, noisy: Tensor, condition: Tensor, token: Tensor, timestep: Tensor) -> Tensor:
+        """epsilon_theta `[B, *latent_shape]`, float32, of a chunk: noised latents, the source's latents, tokens."""
+        latents = torch.cat([noisy, condition], dim=1).to(self.unet.dtype)
+        if self.channels_last:
+            latents = latents.contiguous(memory_format=torch.channels_last)
+        token = token.to(self.unet.dtype)
+        return self.unet(latents, timestep, encoder_hidden_states=token, return_dict=False)[0].float()
+
+    def denoising_error(
+        self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor
+    ) -> Tensor:
+        """See `Prior.denoising_error`. A chunk's gradient is taken with its value, so memory is that of one chunk."""
+        self.check(target, source, pose, timestep, noise)
+
+        def energy(part: slice, poses: Tensor) -> Tensor:
+            residual = self._residual(target[part], source[part], poses, timestep[part], noise[part])
+            return residual.square().flatten(1).mean(dim=1)
+
+        if pose.requires_grad and torch.is_grad_enabled():
+            energies, _ = EnergyAndSlope.apply(pose, energy, self.chunks)
+            return energies
+        return torch.cat(self.chunks.run(lambda part: energy(part, pose[part]), len(pose)))
+
+    # ------------------------------------------------------------ novel views
+
+    def generate(
+        self,
+        source: ViewCode,
+        pose: Tensor,
+        steps: int = 50,
+        guidance: float = 3.0,
+        generator: torch.Generator | None = None,
+        eta: float = 1.0,
+    ) -> Tensor:
+        """See `Prior.generate`; the defaults are those of Zero123's and iFusion's published code."""
+        device = generator.device if generator is not None else pose.device
+        start = torch.randn(len(pose), *self.latent_shape, generator=generator, device=device).to(pose.device)
+        latent = self.sample(source, pose, start, steps, guidance, generator, eta)
+        return self.decode(latent / SCALE).clamp(-1, 1)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        source: ViewCode,
+        pose: Tensor,
+        start: Tensor,
+        steps: int,
+        guidance: float,
+        generator: torch.Generator | None = None,
+        eta: float = 1.0,
+    ) -> Tensor:
+        """The scaled latents `[B, *latent_shape]` of novel views, by DDIM from the noise `start`."""
+        if not (guidance >= 0 and 0 <= eta <= 1):
+            raise UserError(f"guidance must not be negative and eta lie in [0, 1], got {guidance} and {eta}")
+        token = self.token(source.embedding, pose.float())
+        timesteps = ddim_timesteps(steps, self.num_timesteps)
+        latent = start.float()
+        for timestep, following in zip(timesteps, [*timesteps[1:], 0], strict=True):
+            noise = self._guided(latent, source.latent, token, timestep, guidance)
+            fresh = latent
+            if eta > 0:
+                device = generator.device if generator is not None else latent.device
+                fresh = torch.randn(latent.shape, generator=generator, device=device).to(latent)
+            latent = ddim_step(latent, noise, self.alphas_cumprod[timestep], self.alphas_cumprod[following], eta, fresh)
+        return latent
+
+    def _guided(self, latent: Tensor, condition: Tensor, token: Tensor, timestep: int, guidance: float) -> Tensor:
+        """Classifier-free guidance (Ho and Salimans 2022): the null condition is a zero token and a zero latent."""
+
+        def predict(part: slice) -> Tensor:
+            noisy, image, context = latent[part], condition[part], token[part]
+            if guidance != 1:
+                noisy = torch.cat([noisy, noisy])
+                image = torch.cat([torch.zeros_like(image), image])
+                context = torch.cat([torch.zeros_like(context), context])
+            noise = self.predict(noisy, image, context, torch.full((len(noisy),), timestep, device=noisy.device))
+            if guidance == 1:
+                return noise
+            free, conditioned = noise.chunk(2)
+            return free + guidance * (conditioned - free)
+
+        return torch.cat(self.chunks.run(predict, len(latent)))
+
+
+@register("prior", "zero123")
+class Zero123(Zero123Prior):
+    """Zero123: `path` is its checkpoint (105000.ckpt), a folder in diffusers' layout, or a Hugging Face id.
+
+    `weights` chooses the moving averages (as iFusion) or the raw weights (as ID-Pose) of a checkpoint file.
+    """
+
+    def __init__(
+        self,
+        path: str = "kxic/zero123-105000",
+        revision: str | None = None,
+        weights: Averages = "ema",
+        dtype: Dtype = "float32",
+        channels_last: bool = False,
+        compile: bool = False,
+        attention: Attention = "sdpa",
+        max_batch: int | None = None,
+    ) -> None:
+        networks = load_networks(path, revision, weights, dtype)
+        super().__init__(networks, channels_last, compile, attention, max_batch)
+
+
+@register("prior", "zero123xl")
+class Zero123XL(Zero123):
+    """Zero123-XL, trained on Objaverse-XL: as `zero123`; its checkpoint is zero123-xl.ckpt."""
+
+    def __init__(
+        self,
+        path: str = "kxic/zero123-xl",
+        revision: str | None = None,
+        weights: Averages = "ema",
+        dtype: Dtype = "float32",
+        channels_last: bool = False,
+        compile: bool = False,
+        attention: Attention = "sdpa",
+        max_batch: int | None = None,
+    ) -> None:
+        super().__init__(path, revision, weights, dtype, channels_last, compile, attention, max_batch)
