@@ -38,6 +38,10 @@ OPTIONS = (  # Hydra's
     *("--multirun", "-m", "--shell-completion", "-sc", "--config-path", "-cp", "--config-name", "-cn"),
     *("--config-dir", "-cd", "--experimental-rerun", "--info", "-i"),
 )
+WITH_VALUE = (
+    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
+    *("--experimental-rerun", "--info", "-i"),
+)
 HYDRA_VALUE_ERRORS = ("Config group override must be", "Only one of --run", "The --resolve flag")
 
 
@@ -52,6 +56,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     arguments that do not compose, `UserError` for bad input met while running; in a sweep the other jobs go on first.
     """
     options = _options(arguments)
+    arguments = _overrides_first(arguments)
     try:
         registry.discover(_plugin_folders(arguments))
     except OverrideParseException as error:
@@ -142,6 +147,15 @@ def _options(arguments: Sequence[str]) -> dict[str, str]:
     parser.add_argument("--config-name", "-cn")
     known = vars(parser.parse_known_args(arguments)[0])
     return {f"--{key.replace('_', '-')}": value for key, value in known.items() if value is not None}
+
+
+def _overrides_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments with Hydra's options behind the overrides: its parser wants all overrides in one piece."""
+    overrides, options = [], []
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        value = before in WITH_VALUE and ("=" not in argument or before not in ("--info", "-i"))
+        (options if argument.startswith("-") or value else overrides).append(argument)
+    return [*overrides, *options]
 
 
 def _plugin_folders(arguments: Sequence[str]) -> list[str]:

@@ -313,3 +313,8 @@ def test_a_setting_without_a_default_has_to_be_given(lp, jobs, walker, monkeypat
 def test_a_mistake_in_a_process_of_its_own_leaves_no_traceback(lp_process, walker):
     finished = lp_process(*DEMO, "solver.gama=1")
     assert finished.status == 2 and "did you mean 'solver.gamma'" in finished.error
+
+
+def test_options_may_stand_between_overrides(lp):
+    ran = lp("train", "model=energy", "--cfg", "job", "seed=3")
+    assert ran.status == 0 and "name: energy" in ran.out and "seed: 3" in ran.out
