@@ -151,7 +151,8 @@ def _options(arguments: Sequence[str]) -> dict[str, str]:
 
 def _overrides_first(arguments: Sequence[str]) -> list[str]:
     """The arguments with Hydra's options behind the overrides: its parser wants all overrides in one piece."""
-    overrides, options = [], []
+    overrides: list[str] = []
+    options: list[str] = []
     for before, argument in zip(["", *arguments], arguments, strict=False):
         value = before in WITH_VALUE and ("=" not in argument or before not in ("--info", "-i"))
         (options if argument.startswith("-") or value else overrides).append(argument)
