@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.nn import functional
 
-from lp_framework import torchvision_ops
 from lp_framework.errors import UserError, nearest
 from lp_framework.registry import register
 
@@ -170,7 +169,6 @@ class ResNet(Backbone):
             raise UserError(
                 f"backbone.arch='{arch}' is not known{nearest(arch, RESNETS)} (known: {', '.join(RESNETS)})"
             )
-        torchvision_ops.ensure()
         from torchvision.models import get_model
 
         self.image_size, self.frozen = image_size, frozen
