@@ -12,7 +12,7 @@ from zero123_checkpoint import golden, write_checkpoint
 
 from lp_framework.geometry import camera_to_world, se3_exp, view_pose
 from lp_framework.priors.base import ViewCode
-from lp_framework.priors.zero123.ddim import ddim_timesteps
+from lp_framework.priors.ddim import ddim_timesteps
 from lp_framework.priors.zero123.prior import SCALE, Zero123
 
 SIGN = torch.tensor([-1.0, 1.0, 1.0])  # iFusion's (theta, azimuth, distance) has theta = -latitude

@@ -105,10 +105,12 @@ class Commands:
         settings = {"data": "renderings", "data.path": "views", "data.image_size": "16", "hydra.run.dir": name}
         if command == "train":
             settings |= {
-                "backbone": "tmp_tiny", "model.hidden": "16", "data.block": "3", "data.batch_pairs": "40",
+                "backbone": "tmp_tiny", "data.block": "3", "data.batch_pairs": "40",
                 "data.validation_views": "3", "trainer.max_epochs": "3", "logger.tensorboard": "false",
             }  # fmt: skip
-        if any(override.startswith("resume=") for override in overrides):
+            if "model=prior" not in overrides:
+                settings["model.hidden"] = "16"
+        if command in ("convert", "report") or any(override.startswith("resume=") for override in overrides):
             settings = {"hydra.run.dir": name}
         settings |= dict(override.split("=", 1) for override in overrides if not override.startswith("-"))
         options = [override for override in overrides if override.startswith("-")]

@@ -23,6 +23,8 @@ from lp_framework import registry
 from lp_framework.composition import one_line
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
+from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint, load_model
+from lp_framework.solvers.base import Solver
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +68,22 @@ def build_data(config: DictConfig) -> PairDataModule:
         renderer = registry.build("renderer", config.renderer)
     data: PairDataModule = registry.build("data", config.data, renderer=renderer)
     return data
+
+
+def build_solver(config: DictConfig) -> tuple[Solver, Path | None]:
+    """The solver of a config and the checkpoint of its model, with those of model and prior that it asks for.
+
+    The model is that of `config.checkpoint`, else the latest training run's, else the one that ships.
+    """
+    wanted = registry.component_names(registry.get("solver", config.solver.name))
+    components: dict[str, Any] = {}
+    checkpoint: Path | None = None
+    if "model" in wanted:
+        checkpoint = default_checkpoint() if config.checkpoint is None else find_checkpoint(config.checkpoint)
+        components["model"] = load_model(checkpoint)
+    if "prior" in wanted:
+        components["prior"] = registry.build("prior", config.prior)
+    return registry.build("solver", config.solver, **components), checkpoint
 
 
 def seed_run(seed: object) -> None:

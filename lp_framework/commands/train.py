@@ -36,7 +36,9 @@ from lp_framework.commands.building import (
 )
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json
-from lp_framework.models.checkpoints import BEST, FOLDER, LAST, RECIPE, KeepRecipe, read_checkpoint
+from lp_framework.models.checkpoints import BEST, FOLDER, LAST, KeepRecipe, read_checkpoint
+from lp_framework.models.model_folder import RECIPE
+from lp_framework.models.pose_model import PoseModel
 from lp_framework.viz.pictures import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
@@ -61,8 +63,8 @@ def run(config: DictConfig) -> None:
     data = build_data(config)
     backbone = registry.build("backbone", config.backbone)
     model = registry.build("model", config.model, backbone=backbone)
-    if backbone.frozen:
-        data.cache_features(backbone)
+    if (extractor := model.extractor()) is not None:
+        data.cache_features(extractor)
     trainer = build_trainer(config, folder, callbacks(config, folder, recipe), loggers(config, folder))
     if trainer.is_global_zero:
         OmegaConf.save(config, folder / "config.yaml")
@@ -138,6 +140,13 @@ def loggers(config: DictConfig, folder: Path) -> list[Logger]:
     return chosen
 
 
+def next_command(recipe: dict[str, Any], folder: str) -> str:
+    """How the trained model is used."""
+    if issubclass(registry.get("model", recipe["model"]["name"]), PoseModel):
+        return f"python -m lp_framework eval checkpoint={folder}"
+    return f"python -m lp_framework views prior.path={folder}"
+
+
 def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
     """Keep the rows of a run that goes on, up to its checkpoint's step: Lightning would begin the file anew."""
     if not file.is_file():
@@ -165,4 +174,4 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
     console.print(f"model:   {folder / FOLDER / BEST}")
     for picture in save_training_picture(folder):
         console.print(f"picture: {picture}")
-    console.print(f"next:    python -m lp_framework eval checkpoint={shlex.quote(str(folder))}")
+    console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)))}")

@@ -51,6 +51,8 @@ class ToyData(RenderedData):
         path: str = "datasets/toy",
         resolution: int = 256,
         test_views: int = 8,
+        latitude_step_degrees: float = 7.5,
+        longitude_step_degrees: float = 15.0,
         workers: int | None = None,
         cache: str = "datasets/cache",
         image_size: int = 256,
@@ -61,7 +63,12 @@ class ToyData(RenderedData):
     ) -> None:
         super().__init__(path, cache, image_size, batch_pairs, block, validation_views, seed)
         self.renderer, self.workers = renderer, workers
-        self.protocol = ViewProtocol(resolution=resolution, test_views=test_views)
+        self.protocol = ViewProtocol(
+            resolution=resolution,
+            test_views=test_views,
+            latitude_step_degrees=latitude_step_degrees,
+            longitude_step_degrees=longitude_step_degrees,
+        )
 
     def objects(self) -> list[MeshObject]:
         """The embedded objects."""
@@ -79,6 +86,8 @@ class MeshData(RenderedData):
         views: str | None = None,
         resolution: int = 512,
         test_views: int = 8,
+        latitude_step_degrees: float = 7.5,
+        longitude_step_degrees: float = 15.0,
         workers: int | None = None,
         cache: str = "datasets/cache",
         image_size: int = 256,
@@ -91,7 +100,12 @@ class MeshData(RenderedData):
         folder = views if views is not None else f"datasets/{self.meshes.resolve().name}"
         super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
         self.renderer, self.workers = renderer, workers
-        self.protocol = ViewProtocol(resolution=resolution, test_views=test_views)
+        self.protocol = ViewProtocol(
+            resolution=resolution,
+            test_views=test_views,
+            latitude_step_degrees=latitude_step_degrees,
+            longitude_step_degrees=longitude_step_degrees,
+        )
 
     def objects(self) -> list[MeshObject]:
         """One object a mesh file, named after it, sorted by name."""

@@ -12,11 +12,13 @@ from lightning import Callback, LightningModule, Trainer
 
 from lp_framework import registry
 from lp_framework.errors import UserError
+from lp_framework.models.model_folder import RECIPE, WEIGHTS, read_model_folder
 from lp_framework.models.pose_model import PoseModel
+from lp_framework.models.trained_module import TrainedModule
 
-RECIPE = "lp_framework"  # key in the checkpoint: the configs of model and backbone
 FOLDER = "checkpoints"
 LAST, BEST = "last.ckpt", "best.ckpt"
+SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
 
 
 class KeepRecipe(Callback):
@@ -31,7 +33,12 @@ class KeepRecipe(Callback):
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint of this framework, as tensors, numbers and text only; `UserError` for others."""
+    """The contents of a checkpoint of this framework, as tensors, numbers and text only; `UserError` for others.
+
+    `path` is a file that training wrote, or the safetensors of a model's folder (see `model_folder`).
+    """
+    if path.name == WEIGHTS:
+        return read_model_folder(path.parent)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -46,10 +53,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def find_checkpoint(path: str | Path) -> Path:
-    """The checkpoint file that `path` means: the file itself, or the best (else last) one of a run's folder."""
+    """The file that `path` means: itself, a run's best (else last) checkpoint, the weights of a model's folder."""
     path = Path(path)
     if not path.is_dir():
         return path
+    if (path / WEIGHTS).is_file():
+        return path / WEIGHTS
     for folder in (path / FOLDER, path):
         for name in (BEST, LAST):
             if (folder / name).is_file():
@@ -57,40 +66,49 @@ def find_checkpoint(path: str | Path) -> Path:
     raise UserError(f"{path}: holds no {FOLDER}/{BEST} or {LAST}; give a run's folder or a checkpoint file")
 
 
-def newest_checkpoint(runs: str | Path = "runs/train") -> Path:
-    """The checkpoint of the latest training run below the working directory."""
-    found = sorted(Path(runs).glob(f"*/{FOLDER}/{LAST}"), key=lambda file: file.stat().st_mtime)
-    if not found:
-        raise UserError(f"there is no trained model below {runs}: run `lp train` first, or give checkpoint=PATH")
-    return find_checkpoint(found[-1].parents[1])
+def default_checkpoint(runs: str | Path = "runs/train") -> Path:
+    """The latest training run's pose model below the working directory; where there is none, the one that ships."""
+    found = sorted(Path(runs).glob(f"*/{FOLDER}/{LAST}"), key=lambda file: file.stat().st_mtime, reverse=True)
+    for file in found:
+        best = find_checkpoint(file.parents[1])
+        if issubclass(registry.get("model", read_checkpoint(best)[RECIPE]["model"]["name"]), PoseModel):
+            return best
+    return SHIPPED / "score" / WEIGHTS
 
 
 def load_model(path: str | Path) -> PoseModel:
-    """The model of a checkpoint file or a run's folder, ready for use.
+    """The pose model of a checkpoint file or a run's folder, ready for use.
 
     Raises `UserError` naming the file when it is missing, damaged, or its weights do not fit the model it names.
     """
     file = find_checkpoint(path)
-    checkpoint = read_checkpoint(file)
+    model = restore(file, read_checkpoint(file))
+    if not isinstance(model, PoseModel):
+        raise UserError(f"{file}: holds a prior, not a model of the pose; use it with prior=tiny prior.path={path}")
+    return model
+
+
+def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
+    """The trained module that a checkpoint (see `read_checkpoint`) holds; `file` names it in errors."""
     recipe = checkpoint[RECIPE]
     try:
         settings = dict(recipe["backbone"])
         if settings.get("pretrained") and not settings.get("frozen"):
             settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
         backbone = registry.build("backbone", settings)
-        model = registry.build("model", recipe["model"], backbone=backbone)
+        model: TrainedModule = registry.build("model", recipe["model"], backbone=backbone)
         model.on_load_checkpoint(checkpoint)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
+    kind = recipe["model"]["name"]
     try:
         missing, unexpected = model.load_state_dict(checkpoint["state_dict"], strict=False)
     except RuntimeError as error:  # of other shapes
         raise UserError(
-            f"{file}: its weights are of another {recipe['model']['name']} model: {str(error).splitlines()[-1].strip()}"
+            f"{file}: its weights are of another {kind} model: {str(error).splitlines()[-1].strip()}"
         ) from error
     if missing or unexpected:
         raise UserError(
-            f"{file}: its weights are of another {recipe['model']['name']} model: missing {missing[:2]}, "
-            f"unknown {unexpected[:2]}"
+            f"{file}: its weights are of another {kind} model: missing {missing[:2]}, unknown {unexpected[:2]}"
         )
     return model.eval().requires_grad_(False)

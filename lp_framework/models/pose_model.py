@@ -5,24 +5,22 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
-from lightning import LightningModule
 from torch import Tensor
 
 from lp_framework.data.pairs import PairBatch
-from lp_framework.errors import UserError
 from lp_framework.keyed_random import keyed_normal, keyed_uniform
 from lp_framework.models.backbones import Backbone
 from lp_framework.models.networks import PoseNetwork
 from lp_framework.models.objectives import NoisedPose, PoseKernel
 from lp_framework.models.pair_mean import PairMean
+from lp_framework.models.trained_module import TrainedModule, check_settings
 from lp_framework.models.view_head import ViewHead
 from lp_framework.registry import register
 
 VALIDATION_NOISES = 4  # noised poses a validation pair
-WEIGHTS = {"state_dict", "current_model_state"}  # where a checkpoint has weights; the second is of a moving average
 # Relative poses of views with latitudes in [-30, 30] degrees and radii in [1.2, 2.0].
 LOW, HIGH = (-math.pi / 3, 0.0, -0.8), (math.pi / 3, 2 * math.pi, 0.8)
 
@@ -34,7 +32,7 @@ class FieldValue(NamedTuple):
     energy: Tensor | None
 
 
-class PoseModel(LightningModule):
+class PoseModel(TrainedModule):
     """Training and use shared by both models; a subclass says what its network's output means.
 
     For use: `encode` images once, `condition` the network on pairs of them, then ask for the `field` at any poses.
@@ -61,19 +59,14 @@ class PoseModel(LightningModule):
         schedule: Literal["cosine", "constant"] = "cosine",
         seed: int = 0,
     ) -> None:
-        super().__init__()
-        for name, value, fits, wanted in (
+        super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
+        check_settings(
             ("hidden", hidden, hidden >= 1, "at least 1"),
             ("layers", layers, layers >= 0, "at least 0"),
             ("frequencies", frequencies, frequencies >= 1, "at least 1"),
             ("dropout", dropout, 0 <= dropout < 1, "in [0, 1)"),
             ("view_loss", view_loss, view_loss >= 0, "at least 0"),
-            ("learning_rate", learning_rate, learning_rate >= 0, "at least 0"),
-            ("weight_decay", weight_decay, weight_decay >= 0, "at least 0"),
-        ):
-            if not fits:
-                raise UserError(f"model.{name} must be {wanted}, got {value}")
-        self.backbone = backbone
+        )
         self.kernel = PoseKernel(target, sigma)
         self.noised_pose = NoisedPose(noise, sigma, noise_low, noise_high)
         self.network = PoseNetwork(
@@ -81,8 +74,6 @@ class PoseModel(LightningModule):
         )
         self.view_head = ViewHead(backbone.feature_dim) if view_loss > 0 else None
         self.view_loss = view_loss
-        self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
-        self.schedule, self.seed = schedule, seed
         self.validation_loss = PairMean()
 
     # ------------------------------------------------------------ use
@@ -134,72 +125,12 @@ class PoseModel(LightningModule):
         assert batch.images is not None  # a batch has one or the other
         return self.encode(batch.images)
 
-    def on_train_batch_start(self, batch: PairBatch, batch_idx: int) -> None:
-        """Dropout draws from the global generator: keyed as the noise is, apart from it."""
-        torch.manual_seed(self._step_key() + (1 << 62))
-
-    def _generator(self) -> torch.Generator:
-        """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does."""
-        generator = torch.Generator(self.device)
-        generator.manual_seed(self._step_key())
-        return generator
-
-    def _step_key(self) -> int:
-        return (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank
-
     def _validation_noise(self, true: Tensor, pairs: Tensor) -> Tensor:
         """Noised poses keyed by pair: the same in every epoch, batching and number of processes."""
         count = true.shape[1] * 3
         if self.noised_pose.noise == "gaussian":
             return true + self.noised_pose.sigma * keyed_normal(self.seed, pairs, count=count).view(true.shape).to(true)
         return self.noised_pose.place(keyed_uniform(self.seed, pairs, count=count).view(true.shape).to(true))
-
-    def configure_optimizers(self) -> Any:
-        parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
-        kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
-        optimizer = kind(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
-        if self.schedule == "constant":
-            return optimizer
-        total = int(self.trainer.estimated_stepping_batches)
-        warm_up = max(1, min(200, total // 10))
-
-        def factor(step: int) -> float:
-            return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
-
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
-
-    # ------------------------------------------------------------ checkpoints
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A frozen trunk comes with its backbone: its fingerprint is kept, its weights are left out."""
-        if not self.backbone.frozen:
-            return
-        checkpoint["trunk"] = self.backbone.fingerprint()
-        trunk = set(self._trunk_keys())
-        for state in WEIGHTS & checkpoint.keys():
-            checkpoint[state] = {key: value for key, value in checkpoint[state].items() if key not in trunk}
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Put the frozen trunk's weights back, so that the rest is still checked strictly.
-
-        Raises `UserError` when the trunk here is not the one that the rest was trained on.
-        """
-        if not self.backbone.frozen:
-            return
-        if checkpoint.get("trunk") != self.backbone.fingerprint():
-            raise UserError(
-                "the frozen part of its backbone has other weights here than when the model was trained; "
-                "the pretrained weights of that time are wanted"
-            )
-        here = self.state_dict()
-        for state in WEIGHTS & checkpoint.keys():
-            checkpoint[state].update({key: here[key] for key in self._trunk_keys()})
-
-    def _trunk_keys(self) -> list[str]:
-        trunk = self.backbone.trunk_module()
-        prefix = next(name for name, module in self.named_modules() if module is trunk)
-        return [f"{prefix}.{key}" for key in trunk.state_dict()]
 
 
 @register("model", "score")

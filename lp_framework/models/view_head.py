@@ -14,24 +14,31 @@ from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch
 
+# One over the spread of latitude differences (radians) and radius differences (scene units) of the paper's views.
+SCALE = (2.0, 3.0)
+
+
+def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
+    """Mean squared error of the relative pose over the batch's pairs, a scalar.
+
+    `readout` `[I, 4]` of the views: real and imaginary part of the longitude's phase, scaled latitude and radius.
+    """
+    true = batch.relative_poses()
+    phase = torch.complex(readout[:, 0], readout[:, 1])
+    turn = phase[batch.query] * phase[batch.reference].conj()
+    difference = readout[batch.query, 2:] - readout[batch.reference, 2:]
+    error = difference - true[:, ::2] * true.new_tensor(SCALE)
+    longitude = torch.view_as_real(turn - torch.polar(torch.ones_like(true[:, 1]), true[:, 1]))
+    return longitude.square().sum(dim=-1).mean() + error.square().mean()
+
 
 class ViewHead(nn.Module):
-    """Linear map of features `[I, D]` to (real and imaginary part of the longitude's phase, latitude, radius)."""
-
-    # One over the spread of latitude differences (radians) and radius differences (scene units) of the paper's views.
-    SCALE = (2.0, 3.0)
+    """The linear readout of features `[I, D]`, and its loss."""
 
     def __init__(self, feature_dim: int) -> None:
         super().__init__()
         self.readout = nn.Linear(feature_dim, 4)
 
     def loss(self, features: Tensor, batch: PairBatch) -> Tensor:
-        """Mean squared error of the relative pose over the batch's pairs."""
-        values = self.readout(features).float()
-        true = batch.relative_poses()
-        phase = torch.complex(values[:, 0], values[:, 1])
-        turn = phase[batch.query] * phase[batch.reference].conj()
-        difference = values[batch.query, 2:] - values[batch.reference, 2:]
-        error = difference - true[:, ::2] * true.new_tensor(self.SCALE)
-        longitude = torch.view_as_real(turn - torch.polar(torch.ones_like(true[:, 1]), true[:, 1]))
-        return longitude.square().sum(dim=-1).mean() + error.square().mean()
+        """See `relative_pose_loss`."""
+        return relative_pose_loss(self.readout(features).float(), batch)

@@ -10,10 +10,10 @@ from torch.nn import functional
 
 from lp_framework.errors import UserError
 from lp_framework.priors.base import Prior, ViewCode
+from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, standard_normal
 from lp_framework.priors.zero123.attention import Attention, choose_attention
 from lp_framework.priors.zero123.chunks import Chunks, EnergyAndSlope
 from lp_framework.priors.zero123.conditioning import conditioning_vector
-from lp_framework.priors.zero123.ddim import ddim_step, ddim_timesteps, scaled_linear_alphas
 from lp_framework.priors.zero123.networks import Dtype, Networks
 from lp_framework.priors.zero123.original import Averages
 from lp_framework.priors.zero123.weights import load_networks
@@ -154,8 +154,7 @@ class Zero123Prior(Prior):
         eta: float = 1.0,
     ) -> Tensor:
         """See `Prior.generate`; the defaults are those of Zero123's and iFusion's published code."""
-        device = generator.device if generator is not None else pose.device
-        start = torch.randn(len(pose), *self.latent_shape, generator=generator, device=device).to(pose.device)
+        start = standard_normal(pose.new_empty(len(pose), *self.latent_shape), generator)
         latent = self.sample(source, pose, start, steps, guidance, generator, eta)
         return self.decode(latent / SCALE).clamp(-1, 1)
 
@@ -171,22 +170,16 @@ class Zero123Prior(Prior):
         eta: float = 1.0,
     ) -> Tensor:
         """The scaled latents `[B, *latent_shape]` of novel views, by DDIM from the noise `start`."""
-        if not (guidance >= 0 and 0 <= eta <= 1):
-            raise UserError(f"guidance must not be negative and eta lie in [0, 1], got {guidance} and {eta}")
+        if not guidance >= 0:
+            raise UserError(f"guidance must not be negative, got {guidance}")
         token = self.token(source.embedding, pose.float())
-        timesteps = ddim_timesteps(steps, self.num_timesteps)
-        latent = start.float()
-        for timestep, following in zip(timesteps, [*timesteps[1:], 0], strict=True):
-            noise = self._guided(latent, source.latent, token, timestep, guidance)
-            fresh = latent
-            if eta > 0:
-                device = generator.device if generator is not None else latent.device
-                fresh = torch.randn(latent.shape, generator=generator, device=device).to(latent)
-            latent = ddim_step(latent, noise, self.alphas_cumprod[timestep], self.alphas_cumprod[following], eta, fresh)
-        return latent
+        return ddim_sample(
+            lambda latent, timestep: self._guided(latent, source.latent, token, timestep, guidance),
+            start.float(), self.alphas_cumprod, steps, eta, generator,
+        )  # fmt: skip
 
     def _guided(self, latent: Tensor, condition: Tensor, token: Tensor, timestep: int, guidance: float) -> Tensor:
-        """Classifier-free guidance (Ho and Salimans 2022): the null condition is a zero token and a zero latent."""
+        """The guided prediction; the null condition is a zero token and a zero latent."""
 
         def predict(part: slice) -> Tensor:
             noisy, image, context = latent[part], condition[part], token[part]
@@ -198,7 +191,7 @@ class Zero123Prior(Prior):
             if guidance == 1:
                 return noise
             free, conditioned = noise.chunk(2)
-            return free + guidance * (conditioned - free)
+            return guided(free, conditioned, guidance)
 
         return torch.cat(self.chunks.run(predict, len(latent)))
 

@@ -5,6 +5,8 @@ Symbols: `alpha` is the paper's alpha_t (Ho et al.'s alpha-bar_t), `latent` its 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -37,3 +39,34 @@ def ddim_step(latent: Tensor, noise: Tensor, alpha: Tensor, alpha_next: Tensor, 
     image = (latent - (1 - alpha).sqrt() * noise) / alpha.sqrt()  # "predicted x_0"
     direction = (1 - alpha_next - sigma.square()).sqrt() * noise  # "direction pointing to x_t"
     return alpha_next.sqrt() * image + direction + sigma * fresh
+
+
+def ddim_sample(
+    predict: Callable[[Tensor, int], Tensor],
+    start: Tensor,
+    alphas: Tensor,
+    steps: int,
+    eta: float,
+    generator: torch.Generator | None,
+) -> Tensor:
+    """Latents `[B, ...]` from the noise `start`, in `steps`; `predict(latent, timestep)` is epsilon_theta."""
+    if not 0 <= eta <= 1:
+        raise UserError(f"eta must lie in [0, 1], got {eta}")
+    timesteps = ddim_timesteps(steps, len(alphas))
+    latent = start
+    for timestep, following in zip(timesteps, [*timesteps[1:], 0], strict=True):
+        noise = predict(latent, timestep)
+        fresh = standard_normal(latent, generator) if eta > 0 else latent
+        latent = ddim_step(latent, noise, alphas[timestep], alphas[following], eta, fresh)
+    return latent
+
+
+def standard_normal(like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Standard normal noise of the shape, device and dtype of `like`, drawn on the generator's device."""
+    device = generator.device if generator is not None else like.device
+    return torch.randn(like.shape, generator=generator, device=device).to(like)
+
+
+def guided(unconditional: Tensor, conditional: Tensor, guidance: float) -> Tensor:
+    """Classifier-free guidance (Ho and Salimans 2022) of predicted noise; `guidance` 1 is the conditional alone."""
+    return unconditional + guidance * (conditional - unconditional)

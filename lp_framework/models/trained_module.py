@@ -1,0 +1,111 @@
+"""What all trained modules share: optimiser and rate, keyed noise, and checkpoints without the frozen trunk."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch
+from lightning import LightningModule
+
+from lp_framework.data.module import FeatureExtractor
+from lp_framework.data.pairs import PairBatch
+from lp_framework.errors import UserError
+from lp_framework.models.backbones import Backbone
+
+WEIGHTS = {"state_dict", "current_model_state"}  # where a checkpoint has weights; the second is of a moving average
+
+
+class TrainedModule(LightningModule):
+    """A LightningModule on a backbone."""
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        optimizer: Literal["adam", "adamw"],
+        learning_rate: float,
+        weight_decay: float,
+        schedule: Literal["cosine", "constant"],
+        seed: int,
+    ) -> None:
+        super().__init__()
+        check_settings(
+            ("learning_rate", learning_rate, learning_rate >= 0, "at least 0"),
+            ("weight_decay", weight_decay, weight_decay >= 0, "at least 0"),
+        )
+        self.backbone = backbone
+        self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
+        self.schedule, self.seed = schedule, seed
+
+    # ------------------------------------------------------------ training
+
+    def extractor(self) -> FeatureExtractor | None:
+        """What of an image the data module shall compute once and cache: the frozen trunk's features; else nothing."""
+        return self.backbone if self.backbone.frozen else None
+
+    def on_train_batch_start(self, batch: PairBatch, batch_idx: int) -> None:
+        """Dropout draws from the global generator: keyed as the noise is, apart from it."""
+        torch.manual_seed(self._step_key() + (1 << 62))
+
+    def _generator(self) -> torch.Generator:
+        """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does."""
+        generator = torch.Generator(self.device)
+        generator.manual_seed(self._step_key())
+        return generator
+
+    def _step_key(self) -> int:
+        return (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank
+
+    def configure_optimizers(self) -> Any:
+        parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
+        optimizer = kind(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
+        if self.schedule == "constant":
+            return optimizer
+        total = int(self.trainer.estimated_stepping_batches)
+        warm_up = max(1, min(200, total // 10))
+
+        def factor(step: int) -> float:
+            return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, step / total)))
+
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    # ------------------------------------------------------------ checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """A frozen trunk comes with its backbone: its fingerprint is kept, its weights are left out."""
+        if not self.backbone.frozen:
+            return
+        checkpoint["trunk"] = self.backbone.fingerprint()
+        trunk = set(self._trunk_keys())
+        for state in WEIGHTS & checkpoint.keys():
+            checkpoint[state] = {key: value for key, value in checkpoint[state].items() if key not in trunk}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Put the frozen trunk's weights back, so that the rest is still checked strictly.
+
+        Raises `UserError` when the trunk here is not the one that the rest was trained on.
+        """
+        if not self.backbone.frozen:
+            return
+        if checkpoint.get("trunk") != self.backbone.fingerprint():
+            raise UserError(
+                "the frozen part of its backbone has other weights here than when the model was trained; "
+                "the pretrained weights of that time are wanted"
+            )
+        here = self.state_dict()
+        for state in WEIGHTS & checkpoint.keys():
+            checkpoint[state].update({key: here[key] for key in self._trunk_keys()})
+
+    def _trunk_keys(self) -> list[str]:
+        trunk = self.backbone.trunk_module()
+        prefix = next(name for name, module in self.named_modules() if module is trunk)
+        return [f"{prefix}.{key}" for key in trunk.state_dict()]
+
+
+def check_settings(*settings: tuple[str, float, bool, str]) -> None:
+    """`UserError` for the first setting (name, value, whether it fits, what is wanted) that does not fit."""
+    for name, value, fits, wanted in settings:
+        if not fits:
+            raise UserError(f"model.{name} must be {wanted}, got {value}")

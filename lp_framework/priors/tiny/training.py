@@ -1,0 +1,144 @@
+"""Training of the tiny prior: `python -m lp_framework train model=prior`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lp_framework.data.module import FeatureExtractor
+from lp_framework.data.pairs import PairBatch
+from lp_framework.keyed_random import keyed_bits, keyed_normal
+from lp_framework.models.backbones import Backbone
+from lp_framework.models.pair_mean import PairMean
+from lp_framework.models.trained_module import TrainedModule, check_settings
+from lp_framework.models.view_head import relative_pose_loss
+from lp_framework.priors.ddim import scaled_linear_alphas
+from lp_framework.priors.tiny.latents import shrink
+from lp_framework.priors.tiny.networks import TinyNetworks, predicted_noise, readout
+from lp_framework.registry import register
+
+DECODED = 8  # images a step that the decoder is trained on; it is the costliest part
+
+
+class TrunkAndPixels:
+    """What of an image is computed once: a frozen trunk's features, and the pixels of the small image after them."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        self.backbone = backbone
+        self.trunk_dim = backbone.trunk_dim + shrink(torch.zeros(1, 3, 1, 1)).shape[1]
+
+    def trunk(self, images: Tensor) -> Tensor:
+        """`[I, trunk_dim]` of images `[I, 3, H, W]`."""
+        return torch.cat([self.backbone.trunk(images), shrink(images)], dim=1)
+
+    def fingerprint(self) -> str:
+        """See `FeatureExtractor`."""
+        return f"{self.backbone.fingerprint()} and pixels"
+
+
+@register("model", "prior")
+class PriorModel(TrainedModule):
+    """The tiny prior: a pose-conditioned diffusion model of small images, trained by denoising (Ho et al. 2020)."""
+
+    alphas_cumprod: Tensor
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        latent_dim: int = 192,
+        scale: float = 0.5,
+        orders: int = 4,
+        width: int = 384,
+        layers: int = 3,
+        view_loss: float = 1.0,
+        optimizer: Literal["adam", "adamw"] = "adamw",
+        learning_rate: float = 2e-3,
+        weight_decay: float = 1e-2,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
+        check_settings(
+            ("latent_dim", latent_dim, 1 <= latent_dim <= 3072, "from 1 to 3072"),
+            ("scale", scale, scale > 0, "positive"),
+            ("orders", orders, orders >= 1, "at least 1"),
+            ("width", width, width >= 1, "at least 1"),
+            ("layers", layers, layers >= 0, "at least 0"),
+            ("view_loss", view_loss, view_loss >= 0, "at least 0"),
+        )
+        self.networks = TinyNetworks(backbone.feature_dim, latent_dim, scale, orders, width, layers)
+        self.view_loss = view_loss
+        self.register_buffer("alphas_cumprod", scaled_linear_alphas(), persistent=False)
+        self.validation_loss = PairMean()
+
+    def extractor(self) -> FeatureExtractor | None:
+        return TrunkAndPixels(self.backbone) if self.backbone.frozen else None
+
+    def on_fit_start(self) -> None:
+        """The latents' basis is that of the training views; a run that goes on has it already."""
+        if self.networks.latents.fitted:
+            return
+        data = self.trainer.datamodule.data("train")  # type: ignore[attr-defined]
+        views = torch.arange(len(data.table))
+        alone = [data[part[:, None].expand(-1, 2).numpy()] for part in views.split(256)]  # pairs of a view with itself
+        pixels = [self._inputs(batch)[1] for batch in alone]
+        self.networks.latents.fit(torch.cat(pixels).to(self.device))
+
+    # ------------------------------------------------------------ use
+
+    def code(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Latents `[I, latent_dim]` and codes `[I, code_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
+        return self.networks.latents(shrink(images)), self.networks.encoder(self.backbone(images))
+
+    # ------------------------------------------------------------ training
+
+    def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
+        features, pixels = self._inputs(batch)
+        code, latents = self.networks.encoder(features), self.networks.latents(pixels)
+        generator = self._generator()
+        timestep = torch.randint(len(self.alphas_cumprod), (len(batch),), generator=generator, device=self.device)
+        noise = torch.randn(len(batch), latents.shape[1], generator=generator, device=self.device)
+        error, predicted = self._denoise(batch, code, latents, timestep, noise)
+        view_loss = relative_pose_loss(readout(code, self.networks.orders), batch)
+
+        # The decoder sees what it will have to decode: latents of views, and predictions of them.
+        chosen = torch.randperm(len(batch), generator=generator, device=self.device)[:DECODED]
+        seen = torch.arange(len(chosen), device=self.device)[:, None] % 2 == 0
+        query = batch.query[chosen]
+        image = self.networks.decoder(torch.where(seen, latents[query], predicted[chosen].detach()))
+        image_loss = functional.mse_loss(image.flatten(1), pixels[query])
+
+        loss = error.mean()
+        for name, value in (("loss", loss), ("view_loss", view_loss), ("image_loss", image_loss)):
+            self.log(f"train/{name}", value, prog_bar=True, batch_size=len(batch))
+        return loss + self.view_loss * view_loss + image_loss
+
+    def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
+        features, pixels = self._inputs(batch)
+        latents = self.networks.latents(pixels)
+        timestep = keyed_bits(self.seed, batch.pairs, count=1).squeeze(-1) % len(self.alphas_cumprod)
+        noise = keyed_normal(self.seed, batch.pairs, count=latents.shape[1]).to(latents)
+        error, _ = self._denoise(batch, self.networks.encoder(features), latents, timestep, noise)
+        self.validation_loss.update(batch.pairs, error)
+        self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
+
+    def _inputs(self, batch: PairBatch) -> tuple[Tensor, Tensor]:
+        """Features and pixels of the batch's views."""
+        if batch.features is None:
+            assert batch.images is not None  # a batch has one or the other
+            return self.backbone(batch.images), shrink(batch.images)
+        trunk = self.backbone.trunk_dim
+        return self.backbone.head(batch.features[:, :trunk]), batch.features[:, trunk:]
+
+    def _denoise(
+        self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Denoising errors `[P]` of the pairs' queries seen from their references, and the predicted means."""
+        alpha = self.alphas_cumprod[timestep][:, None]
+        noisy = alpha.sqrt() * latents[batch.query] + (1 - alpha).sqrt() * noise
+        predicted = self.networks.predict(code[batch.reference], batch.relative_poses())
+        error = (predicted_noise(noisy, alpha, predicted) - noise).square().mean(dim=1)
+        return error, predicted.mean
