@@ -12,11 +12,15 @@ import sys
 from lp_framework.errors import UserError, nearest
 
 COMMANDS = {  # the module of a command is lp_framework.commands.NAME
-    "train": "Train a score or energy model of the relative pose",
+    "train": "Train a score or energy model of the relative pose, or a prior",
     "eval": "Estimate the poses of a data set's test views and report recall, success rate and errors",
+    "report": "Gather finished evaluations into tables and figures, beside the paper's numbers",
+    "estimate": "Estimate the camera poses of photographs of one object",
+    "views": "Draw novel views around an object by a prior",
+    "landscape": "Show how a prior's energy runs around each object, and whether its least is at the truth",
     "render": "Render meshes to views on disk",
-    "convert": "Turn a published Zero123 checkpoint into a folder of safetensors that loads in seconds",
-    "bench": "Measure how many pairs a second the data loaders deliver, and their memory",
+    "convert": "Turn a Zero123 checkpoint, or a training run, into a folder of safetensors that loads in seconds",
+    "bench": "Measure speed and memory against plain alternatives, side by side",
     "plugins": "List every model, prior, solver, ... with its origin and its settings",
 }
 

@@ -3,153 +3,120 @@
 from __future__ import annotations
 
 import platform
-import time
-from collections.abc import Iterator
-from statistics import median
+import typing
+from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
 import torch
-from lightning.fabric.utilities import move_data_to_device
 from omegaconf import DictConfig
+from rich import box
 from rich.console import Console
-from rich.progress import track
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from lp_framework import registry
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, versions
-from lp_framework.data.pairs import BlockSampler, PairBatch, PairData
-from lp_framework.errors import UserError
+from lp_framework.benchmarks import loader, second_stage
+from lp_framework.benchmarks.section import Section
+from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.device import choose_device
+from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
-from lp_framework.models.pose_model import PoseModel
+from lp_framework.priors.zero123.attention import Attention
+from lp_framework.priors.zero123.networks import Dtype, require_packages
 
-FEATURE_SPACE, PLAIN = "pairs in feature space", "plain pair loader"
+RESULT = "bench.json"
 
 
 @orderly_console()
 def run(config: DictConfig) -> None:
-    """Time training steps (forward, backward, optimiser) on batches of either loader, in turn."""
-    if config.rounds < 1 or config.steps < 1:
-        raise UserError(f"rounds and steps must be at least 1, got {config.rounds} and {config.steps}")
+    """Run the measurements named in `measure`; what has been measured so far is always in `bench.json`."""
+    names = [config.measure] if isinstance(config.measure, str) else list(config.measure)
+    for name in names:
+        _check_choice("measure", name, MEASUREMENTS)
     folder = run_folder()
-    device = _device(config.accelerator)
-    data = build_data(config)
-    data.prepare_data()
-    backbone = registry.build("backbone", config.backbone)
-    model: PoseModel = registry.build("model", config.model, backbone=backbone).to(device)
-    views = data.data("train")
-    contenders = {FEATURE_SPACE: _feature_space(views, config), PLAIN: _plain(views, config.data.batch_pairs)}
-    optimizer = torch.optim.Adam(model.parameters(), lr=0.0)  # the weights stay, so every step does the same work
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    pairs: dict[str, int] = {}
-    kept: dict[str, float] = {}
-    for name, batches in contenders.items():  # warm-up, and the memory
-        kept[name], pairs[name] = _kept_for_backward(model, next(batches), device)
-    for _ in track(range(config.rounds), description="measuring", transient=True):
-        for name, batches in contenders.items():
-            began = time.perf_counter()
-            done = 0
-            for _ in range(config.steps):
-                batch = next(batches)
-                _step(model, optimizer, batch, device)
-                done += len(batch)
-            _synchronise(device)
-            seconds[name].append((time.perf_counter() - began) / done)
-    rates = {name: 1 / median(values) for name, values in seconds.items()}
-    per_pair = {name: kept[name] / pairs[name] for name in contenders}
-    ratio = {
-        "pairs_per_second": rates[FEATURE_SPACE] / rates[PLAIN],
-        "bytes_for_backward_per_pair": per_pair[FEATURE_SPACE] / per_pair[PLAIN],
-    }
-    measured = {
-        name: {"pairs_per_second": rates[name], "bytes_for_backward_per_pair": per_pair[name]} for name in contenders
-    }
-    result = {
-        "loader": {**measured, "ratio": ratio},
+    seed_run(0)
+    device = choose_device(config.accelerator)
+    facts = {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu",
         "threads": torch.get_num_threads(),
         "config": plain(config),
         "versions": versions(),
     }
-    write_json(folder / "bench.json", result)
-    table = Table(
-        title=f"training step, {config.backbone.arch} at {config.backbone.image_size} px", title_justify="left"
-    )
-    for column in ("loader", "pairs a second", "memory for backward, kB a pair"):
-        table.add_column(column, justify="left" if column == "loader" else "right")
-    for name in contenders:
-        table.add_row(name, f"{rates[name]:.0f}", f"{per_pair[name] / 1024:.0f}")
-    table.add_row("ratio", f"{ratio['pairs_per_second']:.1f} x", f"{ratio['bytes_for_backward_per_pair']:.2f} x")
-    Console(highlight=False).print(table)
-    print(f"results: {folder / 'bench.json'}")
+    sections: dict[str, Section] = {}
+    for name in names:
+        measurement = MEASUREMENTS[name](config, device)
+        with _progress() as progress:
+            task = progress.add_task(name, total=1.0)
+            for section in measurement:
+                sections[name] = section
+                write_json(folder / RESULT, {**{key: each.record for key, each in sections.items()}, **facts})
+                progress.update(task, completed=section.done)
+    console = Console(highlight=False, width=None if Console().is_terminal else 110)
+    console.print(table(list(sections.values())))
+    for section in sections.values():
+        if section.note:
+            console.print(f"{section.title.partition(':')[0]}: {section.note}")
+    console.print(f"results: {folder / RESULT}", soft_wrap=True)
 
 
-def _device(accelerator: str) -> torch.device:
-    available = torch.cuda.is_available()
-    if accelerator not in ("auto", "cpu", "cuda") or (accelerator == "cuda" and not available):
-        raise UserError(f"accelerator={accelerator} cannot be had here; choose auto or cpu")
-    return torch.device("cuda" if available and accelerator != "cpu" else "cpu")
+def _loader(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = config.loader
+    _check_counts("loader", settings)
+    data = build_data(config)
+    data.prepare_data()
+    backbone = registry.build("backbone", config.backbone)
+    model = registry.build("model", config.model, backbone=backbone)
+    batch, block = config.data.batch_pairs, config.data.block
+    note = f"{config.backbone.get('arch', config.backbone.name)} at {backbone.image_size} px, {batch} pairs a batch"
+    return loader.measure(data.data("train"), model, batch, block, settings.rounds, settings.steps, device, note)
 
 
-def _feature_space(data: PairData, config: DictConfig) -> Iterator[PairBatch]:
-    sampler = BlockSampler(data.table, config.data.batch_pairs, config.data.block, seed=0)
-    while True:
-        for pairs in sampler:
-            yield data[pairs]
+def _second_stage(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = plain(config.second_stage)
+    _check_counts("second_stage", settings)
+    for key, kind in (("architecture", second_stage.Architecture), ("dtype", Dtype), ("attention", Attention)):
+        _check_choice(f"second_stage.{key}", settings[key], typing.get_args(kind))
+    require_packages()
+    return second_stage.SecondStage(device, **settings).measure()
 
 
-def _plain(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
-    """Pairs drawn at random, two images a pair, as a data set of image pairs gives them."""
-    everything = data.table.pairs()
-    random = np.random.default_rng(0)
-    while True:
-        drawn = everything[random.choice(len(everything), batch_pairs, replace=False)]
-        singles = [data[pair[None]] for pair in drawn]
-        offsets = 2 * torch.arange(batch_pairs)
-        images = [single.images for single in singles if single.images is not None]
-        yield PairBatch(
-            images=torch.cat(images),
-            features=None,
-            poses=torch.cat([single.poses for single in singles]),
-            cameras=torch.cat([single.cameras for single in singles]),
-            objects=torch.cat([single.objects for single in singles]),
-            reference=torch.cat([single.reference for single in singles]) + offsets,
-            query=torch.cat([single.query for single in singles]) + offsets,
-            pairs=torch.cat([single.pairs for single in singles]),
-        )
+MEASUREMENTS: dict[str, Callable[[DictConfig, torch.device], Iterator[Section]]] = {
+    "loader": _loader,
+    "second_stage": _second_stage,
+}
 
 
-def _loss(model: PoseModel, batch: PairBatch, device: torch.device) -> torch.Tensor:
-    batch = move_data_to_device(batch, device)
-    assert batch.images is not None  # no features are cached here
-    features = model.encode(batch.images)
-    true = batch.relative_poses()
-    condition = model.condition(features[batch.reference], features[batch.query])
-    return model.pair_loss(condition, torch.zeros_like(true), true).mean()
+def table(sections: Sequence[Section]) -> Table:
+    """All figures, a section a measurement; ratios are those of the first contender to the second."""
+    result = Table(box=box.SIMPLE, show_header=False, show_edge=False, pad_edge=False)
+    result.add_column()
+    for _ in range(3):
+        result.add_column(justify="right")
+    for section in sections:
+        result.add_row(section.title, *section.contenders, "ratio", style="bold")
+        for figure in section.figures:
+            result.add_row(figure.label, _number(figure.first), _number(figure.second), f"{figure.ratio:.3g} x")
+        result.add_section()
+    return result
 
 
-def _step(model: PoseModel, optimizer: torch.optim.Optimizer, batch: PairBatch, device: torch.device) -> None:
-    optimizer.zero_grad()
-    _loss(model, batch, device).backward()
-    optimizer.step()
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _kept_for_backward(model: PoseModel, batch: PairBatch, device: torch.device) -> tuple[float, int]:
-    """Bytes of the activations that a step keeps for its backward pass, and the batch's number of pairs."""
-    storages: dict[int, int] = {}
-    parameters = {parameter.data_ptr() for parameter in model.parameters()}
-
-    def count(tensor: torch.Tensor) -> torch.Tensor:
-        storage = tensor.untyped_storage()
-        if storage.data_ptr() not in parameters:
-            storages[storage.data_ptr()] = storage.nbytes()
-        return tensor
-
-    with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-        loss = _loss(model, batch, device)
-    loss.backward()
-    return float(sum(storages.values())), len(batch)
+def _progress() -> Progress:
+    console = Console(stderr=True)
+    columns = (TextColumn("measuring {task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
-def _synchronise(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+def _check_counts(section: str, settings: DictConfig | dict[str, object]) -> None:
+    for key in ("rounds", "steps"):
+        value = settings[key]
+        if not isinstance(value, int) or value < 1:
+            raise UserError(f"{section}.{key} must be at least 1, got {value}")
+
+
+def _check_choice(key: str, value: object, known: typing.Iterable[str]) -> None:
+    known = list(known)
+    if value not in known:
+        raise UserError(f"{key}={value} is none of its values{nearest(str(value), known)} (known: {', '.join(known)})")

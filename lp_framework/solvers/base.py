@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.errors import UserError
+from lp_framework.keyed_random import keyed_bits
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,37 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.reference)
+
+
+@dataclass(frozen=True)
+class ViewSets:
+    """S problems of V >= 2 images each, among I images: `images` `[I, 3, H, W]` in [-1, 1] on white, each once; `views`
+    `[S, V]` point to them; `ids` `[S]` are integers that name the sets for good, to which random draws are keyed.
+    """
+
+    images: Tensor
+    views: Tensor
+    ids: Tensor
+
+    def __post_init__(self) -> None:
+        if self.images.ndim != 4 or self.images.shape[1] != 3:
+            raise UserError(f"images must be [I, 3, H, W], got {list(self.images.shape)}")
+        if self.views.ndim != 2 or self.views.shape[1] < 2 or self.ids.shape != self.views.shape[:1]:
+            shapes = [list(each.shape) for each in (self.views, self.ids)]
+            raise UserError(f"views must be [S, V] with V >= 2 and ids [S], got {shapes}")
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def pairs(self, reference: Sequence[int], query: Sequence[int]) -> Pairs:
+        """P pairs of places within a set, for every set: S x P problems, those of a set together.
+
+        Their ids are keyed by the set's id and the two places.
+        """
+        places = torch.tensor([list(reference), list(query)], device=self.views.device)
+        ids = keyed_bits(self.ids[:, None], *places, count=1)
+        chosen = self.views[:, places]  # [S, 2, P]
+        return Pairs(self.images, chosen[:, 0].flatten(), chosen[:, 1].flatten(), ids.flatten())
 
 
 @dataclass(frozen=True)
@@ -63,6 +95,18 @@ class Solution:
         return self.poses[torch.arange(len(self.poses), device=self.poses.device), self.chosen]
 
 
+@dataclass(frozen=True)
+class ViewSolution:
+    """`poses` `[S, V - 1, 3]` of the other views relative to the first; `energies` `[S, V, V]` of the ordered pairs
+    (row: reference, column: query; NaN where a solver did not look); `valid` `[S]`: every pose is sound.
+    """
+
+    poses: Tensor
+    energies: Tensor
+    valid: Tensor
+    cost: Cost
+
+
 def choose(energies: Tensor) -> Tensor:
     """Index `[B]` of the least energy among `[B, N]`; what is not finite is passed over."""
     return energies.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf).argmin(dim=1)
@@ -73,6 +117,17 @@ def check_starts(pairs: Pairs, starts: Tensor) -> None:
     if starts.ndim != 3 or starts.shape[0] != len(pairs) or starts.shape[1] < 1 or starts.shape[2] != 3:
         raise UserError(
             f"starts must be [B, N, 3] with B = {len(pairs)}, got {list(starts.shape)}; for one start pass [:, None]"
+        )
+    if not starts.isfinite().all():
+        raise UserError("starts must be finite numbers")
+
+
+def check_view_starts(view_sets: ViewSets, starts: Tensor) -> None:
+    """`UserError` unless `starts` is `[S, V - 1, N, 3]`, finite, with N >= 1."""
+    sets, views = view_sets.views.shape
+    if starts.ndim != 4 or starts.shape[:2] != (sets, views - 1) or starts.shape[2] < 1 or starts.shape[3] != 3:
+        raise UserError(
+            f"starts must be [S, V - 1, N, 3] with S = {sets} and V - 1 = {views - 1}, got {list(starts.shape)}"
         )
     if not starts.isfinite().all():
         raise UserError("starts must be finite numbers")
@@ -97,3 +152,21 @@ class Solver(ABC):
 
         The result for a pair and start depends on them, on the pair's id and on `seed` alone.
         """
+
+    def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
+        """Solve sets of V images from starts `[S, V - 1, N, 3]`: N for each other view, relative to the first.
+
+        Unless a solver reasons about all views together, each pair with the first view is solved for itself.
+        """
+        check_view_starts(view_sets, starts)
+        sets, views = view_sets.views.shape
+        solution = self.solve(view_sets.pairs([0] * (views - 1), range(1, views)), starts.flatten(0, 1), seed)
+        chosen = solution.chosen[:, None]
+        energies = solution.energies.new_full((sets, views, views), torch.nan)
+        energies[:, 0, 1:] = solution.energies.gather(1, chosen).view(sets, views - 1)
+        return ViewSolution(
+            poses=solution.answer().view(sets, views - 1, 3),
+            energies=energies,
+            valid=solution.valid.gather(1, chosen).view(sets, views - 1).all(dim=1),
+            cost=solution.cost,
+        )

@@ -17,10 +17,10 @@ from lp_framework.models.trained_module import TrainedModule, check_settings
 from lp_framework.models.view_head import relative_pose_loss
 from lp_framework.priors.ddim import scaled_linear_alphas
 from lp_framework.priors.tiny.latents import shrink
-from lp_framework.priors.tiny.networks import TinyNetworks, predicted_noise, readout
+from lp_framework.priors.tiny.networks import Gaussian, TinyNetworks, predicted_noise, readout
 from lp_framework.registry import register
 
-DECODED = 8  # images a step that the decoder is trained on; it is the costliest part
+DECODED = 16  # images a step that the decoder is trained on; it is the costliest part
 
 
 class TrunkAndPixels:
@@ -104,11 +104,12 @@ class PriorModel(TrainedModule):
         error, predicted = self._denoise(batch, code, latents, timestep, noise)
         view_loss = relative_pose_loss(readout(code, self.networks.orders), batch)
 
-        # The decoder sees what it will have to decode: latents of views, and predictions of them.
+        # The decoder sees what it will have to decode: latents of views, and samples of what is predicted.
         chosen = torch.randperm(len(batch), generator=generator, device=self.device)[:DECODED]
         seen = torch.arange(len(chosen), device=self.device)[:, None] % 2 == 0
         query = batch.query[chosen]
-        image = self.networks.decoder(torch.where(seen, latents[query], predicted[chosen].detach()))
+        sampled = (predicted.mean + predicted.log_spread.exp() * noise)[chosen].detach()
+        image = self.networks.decoder(torch.where(seen, latents[query], sampled))
         image_loss = functional.mse_loss(image.flatten(1), pixels[query])
 
         loss = error.mean()
@@ -135,10 +136,10 @@ class PriorModel(TrainedModule):
 
     def _denoise(
         self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Denoising errors `[P]` of the pairs' queries seen from their references, and the predicted means."""
+    ) -> tuple[Tensor, Gaussian]:
+        """Denoising errors `[P]` of the pairs' queries seen from their references, and what was predicted."""
         alpha = self.alphas_cumprod[timestep][:, None]
         noisy = alpha.sqrt() * latents[batch.query] + (1 - alpha).sqrt() * noise
         predicted = self.networks.predict(code[batch.reference], batch.relative_poses())
         error = (predicted_noise(noisy, alpha, predicted) - noise).square().mean(dim=1)
-        return error, predicted.mean
+        return error, predicted

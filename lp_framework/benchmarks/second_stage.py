@@ -1,0 +1,234 @@
+"""Seconds per optimisation step of a pair on Zero123: all starts in one batch, against a plain loop over the starts."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from lp_framework.benchmarks.section import Figure, Section, synchronise
+from lp_framework.errors import UserError
+from lp_framework.priors.base import ViewCode
+from lp_framework.priors.zero123.attention import Attention
+from lp_framework.priors.zero123.networks import (
+    DTYPES,
+    PUBLISHED,
+    Configs,
+    Dtype,
+    Networks,
+    clip_config,
+    unet_config,
+    vae_config,
+)
+from lp_framework.priors.zero123.prior import Zero123Prior
+from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.pair_energy import PairEnergy
+from lp_framework.solvers.starts import Ring
+from lp_framework.solvers.twist import SineRadius, TwistPoses
+
+BATCHED, LOOP = "batched", "plain loop"
+TIMESTEP = 500  # the work is that of any other
+LEARNING_RATE = 0.1
+
+Architecture = Literal["published", "narrow"]
+NARROW: Configs = {  # the same layers, few and narrow: to try the measurement in seconds
+    "unet": unet_config([32, 32], 1, [True, False], heads=4, context=32),
+    "vae": vae_config([32, 32, 32, 32], 1),
+    "image_encoder": clip_config(width=64, layers=1, patch=32, image_size=224, projection=32),
+}
+ARCHITECTURES: Mapping[Architecture, Configs] = {"published": PUBLISHED, "narrow": NARROW}
+
+
+class Batched:
+    """This package's step: both directions of all starts `[1, N, 3]` in one batch, one Adam over all poses.
+
+    Images are encoded when `energy` is made, and weights have no gradients.
+    """
+
+    def __init__(self, energy: PairEnergy, starts: Tensor) -> None:
+        self.energy, self.steps = energy, 0
+        self.poses = starts.clone().requires_grad_()
+        self.optimizer = torch.optim.Adam([self.poses], LEARNING_RATE)
+
+    def step(self) -> None:
+        """One update of all starts."""
+        noise = self.energy.noise(self.steps)[:, 0]
+        self.optimizer.zero_grad()
+        self.energy(self.poses, TIMESTEP, noise).sum().backward()
+        self.optimizer.step()
+        self.steps += 1
+
+
+class PlainLoop:
+    """One start `[3]` of a sequential loop, its costs those of iFusion's published code (`optimize_pose_loop`).
+
+    As there: both images are encoded anew at every step, by the autoencoder once as targets and once as conditions,
+    by CLIP as conditions; float32; both directions in one batch of two; attention that spells out its weights, also
+    over the single token of the condition; weights without gradients; a twist that lives on the CPU; a loss that is
+    read at every step, for the plateau scheduler. Left out, and next to free: condition dropout, sampling of the
+    posterior, the progress bar.
+    """
+
+    def __init__(self, prior: Zero123Prior, images: Tensor, start: Tensor) -> None:
+        self.prior, self.total = prior, 0.0
+        self.condition, self.target = images, images.flip(0)  # (reference, query) and (query, reference)
+        self.poses = TwistPoses(start.cpu(), SineRadius())
+        self.twist = torch.zeros(6, requires_grad=True)
+        self.optimizer = torch.optim.Adam([self.twist], LEARNING_RATE)
+        self.scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(self.optimizer, factor=0.6, patience=10)
+
+    def loss(self, pose: Tensor, noise: Tensor) -> Tensor:
+        """Mean squared error of both directions for a pose `[3]` and noise `[2, *latent_shape]`."""
+        source = self.prior.encode(self.condition)  # VAE and CLIP
+        latent = self.prior.vae.encode(self.target).latent_dist.mode()  # VAE
+        target = ViewCode(latent, source.embedding)  # a target's embedding is not read
+        poses = torch.stack([pose, -pose]).to(noise.device)
+        timestep = torch.full((2,), TIMESTEP, device=noise.device)
+        return self.prior.residual(target, source, poses, timestep, noise).square().mean()
+
+    def step(self) -> None:
+        """One update of the start."""
+        self.optimizer.zero_grad()
+        noise = torch.randn(2, *self.prior.latent_shape, device=self.condition.device)
+        loss = self.loss(self.poses(self.twist), noise)
+        loss.backward()
+        self.optimizer.step()
+        self.total += loss.item()
+        self.scheduler.step(self.total)
+
+
+@dataclass
+class Measured:
+    """Of one contender with some number of starts: seconds per step of every round, and the largest peak in bytes."""
+
+    seconds: list[float] = field(default_factory=list)
+    peak: int = 0
+
+
+@dataclass(frozen=True)
+class SecondStage:
+    """The measurement: `rounds` of `steps` optimisation steps with each number of `starts`, on random weights.
+
+    `dtype` to `max_batch` are those of `prior=zero123`, for the batch; the loop is as published in any case.
+    """
+
+    device: torch.device
+    architecture: Architecture
+    starts: Sequence[int]
+    rounds: int
+    steps: int
+    dtype: Dtype
+    channels_last: bool
+    compile: bool
+    attention: Attention
+    max_batch: int | None
+
+    def __post_init__(self) -> None:
+        listed = isinstance(self.starts, Sequence) and all(isinstance(each, int) and each > 0 for each in self.starts)
+        if not listed or not self.starts:
+            raise UserError(f"second_stage.starts must list numbers of starts, at least 1 each, got {self.starts}")
+        if self.max_batch is not None and self.max_batch < 1:
+            raise UserError(f"second_stage.max_batch must be at least 1 or null, got {self.max_batch}")
+
+    def measure(self) -> Iterator[Section]:
+        """The section after every stretch of either contender."""
+        batch_prior, loop_prior = self.priors()
+        images = torch.rand(2, 3, 256, 256, device=self.device) * 2 - 1
+        index = torch.arange(2, device=self.device)
+        began = time.perf_counter()
+        energy = PairEnergy(batch_prior, Pairs(images, index[:1], index[1:], ids=index[:1]), seed=0)
+        synchronise(self.device)
+        encoding = time.perf_counter() - began
+        ring = {count: Ring(count).make(index[:1], seed=0) for count in self.starts}
+        batched = {count: Batched(energy, starts) for count, starts in ring.items()}
+        loops = [PlainLoop(loop_prior, images, start) for start in ring[max(self.starts)][0]]
+        self.warm_up(batched, loops[0])
+        measured = {count: {BATCHED: Measured(), LOOP: Measured()} for count in self.starts}
+        done, total = 0, 2 * self.rounds * sum(self.starts)
+        for _ in range(self.rounds):
+            for count in self.starts:
+                contenders: dict[str, tuple[Sequence[Batched | PlainLoop], Zero123Prior]]
+                contenders = {BATCHED: ([batched[count]], batch_prior), LOOP: (loops[:count], loop_prior)}
+                for name, (runners, prior) in contenders.items():
+                    seconds = 0.0
+                    for runner in runners:
+                        stretch, peak = self.run(runner, prior)
+                        seconds += stretch / self.steps
+                        measured[count][name].peak = max(measured[count][name].peak, peak)
+                        done += count // len(runners)
+                        yield self.section(measured, encoding, done / total)
+                    measured[count][name].seconds.append(seconds)
+                yield self.section(measured, encoding, done / total)
+
+    def priors(self) -> tuple[Zero123Prior, Zero123Prior]:
+        """The same random weights for the batch and for the loop; they share memory where nothing converts them."""
+        from diffusers.models.attention_processor import AttnProcessor
+
+        networks = Networks(ARCHITECTURES[self.architecture]).to(self.device)
+        # New parameters around the same storage: a conversion of one does not reach the other.
+        shared: dict[int, Any] = {id(each): nn.Parameter(each.detach(), False) for each in networks.parameters()}
+        loop = Zero123Prior(copy.deepcopy(networks, shared)).to(self.device)
+        loop.unet.set_attn_processor(AttnProcessor())  # softmax(Q K^T / sqrt(d)) V, step by step
+        networks.to(DTYPES[self.dtype])
+        batch = Zero123Prior(networks, self.channels_last, self.compile, self.attention, self.max_batch)
+        return batch.to(self.device), loop
+
+    def warm_up(self, batched: Mapping[int, Batched], loop: PlainLoop) -> None:
+        """A step of each; on a GPU, and compiled, of each number of starts: the first of a size prepares it."""
+        sizes = self.starts if self.device.type == "cuda" or self.compile else [min(self.starts)]
+        for count in sizes:
+            batched[count].step()
+        loop.step()
+
+    def run(self, runner: Batched | PlainLoop, prior: Zero123Prior) -> tuple[float, int]:
+        """Seconds of `steps` steps, and on a GPU the peak of memory in bytes: this contender's weights and its work."""
+        cuda = self.device.type == "cuda"
+        synchronise(self.device)
+        if cuda:
+            torch.cuda.reset_peak_memory_stats(self.device)
+            before = torch.cuda.memory_allocated(self.device)
+        began = time.perf_counter()
+        for _ in range(self.steps):
+            runner.step()
+        synchronise(self.device)
+        seconds = time.perf_counter() - began
+        if not cuda:
+            return seconds, 0
+        weights = sum(each.nbytes for each in prior.parameters())
+        return seconds, torch.cuda.max_memory_allocated(self.device) - before + weights
+
+    def section(self, measured: Mapping[int, Mapping[str, Measured]], encoding: float, done: float) -> Section:
+        """The figures of those numbers of starts that both contenders have gone through."""
+        figures: list[Figure] = []
+        record: dict[str, Any] = {}
+        for count, both in measured.items():
+            entry: dict[str, Any] = {}
+            for name, one in both.items():
+                if one.seconds:
+                    entry[name] = {"seconds_per_step": median(one.seconds), "rounds": list(one.seconds)}
+                    entry[name] |= {"peak_bytes": one.peak} if one.peak else {}
+            if len(entry) == 2:
+                label = f"{count} start{'s' if count > 1 else ''}"
+                rows = [Figure(f"{label}, seconds a step", *(median(one.seconds) for one in both.values()))]
+                if both[LOOP].peak:
+                    rows.append(Figure(f"{label}, peak memory, GB", *(one.peak / 1e9 for one in both.values())))
+                entry["ratio"] = {"seconds_per_step": rows[0].ratio}
+                entry["ratio"] |= {"peak_bytes": rows[1].ratio} if both[LOOP].peak else {}
+                figures += rows
+            if entry:
+                record[str(count)] = entry
+        return Section(
+            "second stage: a step of one pair",
+            (BATCHED, LOOP),
+            figures,
+            {"starts": record, "encoding_seconds": encoding},
+            done,
+            f"Zero123's {self.architecture} size, random weights. {BATCHED}: all starts and both directions together, "
+            f"images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images encoded each step",
+        )

@@ -1,0 +1,114 @@
+"""`landscape`: the prior's energy around each object of a data set, and whether its least is at the truth."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from lp_framework import registry
+from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.device import choose_device
+from lp_framework.data.cache import tracked
+from lp_framework.data.pairs import ViewTable
+from lp_framework.errors import UserError
+from lp_framework.evaluation.azimuth import NEAR_DEGREES, Profile, azimuth_energies, profile, within
+from lp_framework.evaluation.tables import write_json
+from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs
+from lp_framework.viz.azimuth import AzimuthPanel, azimuth_figure
+from lp_framework.viz.style import save_figure
+
+
+@orderly_console()
+@torch.no_grad()
+def run(config: DictConfig) -> None:
+    """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
+    if config.azimuths < 2 or config.noises < 1 or not config.timesteps:
+        raise UserError("azimuths must be at least 2, noises at least 1, and timesteps need one number")
+    folder = run_folder()
+    seed_run(config.seed)
+    device = choose_device(config.accelerator)
+    prior: Prior = registry.build("prior", config.prior).to(device)
+    data = build_data(config)
+    data.evaluate_on(config.protocol, config.seed)
+    data.prepare_data()
+    table = data.table(data.evaluation_split())
+    azimuths = torch.arange(config.azimuths) * (2 * math.pi / config.azimuths)
+    energies, truth, objects = [], [], []
+    for batch in tracked(list(data.test_dataloader()), "energies around the objects"):
+        assert batch.images is not None  # nothing caches features here
+        ids = table.pair_ids(batch.pairs)
+        pairs = Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
+        poses = batch.relative_poses()
+        energies.append(
+            azimuth_energies(
+                prior, pairs, poses.to(device), azimuths, config.timesteps, config.noises, config.seed
+            ).cpu()
+        )
+        truth.append(poses[:, 1])
+        objects.append(batch.objects[batch.reference])
+    rows = summarise(table, torch.cat(energies), azimuths, torch.cat(truth), torch.cat(objects))
+    record = {"objects": rows, **overall(rows), "config": plain(config), "versions": versions()}
+    write_json(folder / "azimuth.json", record)
+    panels = [
+        AzimuthPanel(row["object"], row["ambiguity"], row["degrees"], row["energy"], row["within"]) for row in rows
+    ]
+    pictures = save_figure(azimuth_figure(panels), folder / "azimuth")
+    console = Console(width=None if Console().is_terminal else 110, highlight=False)
+    console.print(terminal_table(f"{config.data.name}, prior={config.prior.name}", rows, record))
+    console.print(f"results: {folder / 'azimuth.json'}", soft_wrap=True)
+    console.print(f"picture: {pictures[0]}", soft_wrap=True)
+
+
+def summarise(
+    table: ViewTable, energies: torch.Tensor, azimuths: torch.Tensor, truth: torch.Tensor, objects: torch.Tensor
+) -> list[dict[str, Any]]:
+    """A row an object: its share of pairs `within` the limit, its profile and the minima of that."""
+    near = within(energies, azimuths, truth)
+    rows = []
+    for index, name in enumerate(table.names):
+        mask = objects == index
+        curve: Profile = profile(energies[mask], azimuths, truth[mask])
+        rows.append(
+            {
+                "object": name, "ambiguity": table.ambiguities[index], "unique_answer": table.unique_answer[index],
+                "pairs": int(mask.sum()), "within": near[mask].double().mean().item(),
+                "relief": curve.relief, "minima": [minimum._asdict() for minimum in curve.minima()],
+                "degrees": curve.degrees.tolist(), "energy": curve.energy.tolist(),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def overall(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    """The share of pairs within the limit, over all objects and over those with a unique answer."""
+
+    def share(chosen: list[dict[str, Any]]) -> float | None:
+        pairs = sum(row["pairs"] for row in chosen)
+        return sum(row["within"] * row["pairs"] for row in chosen) / pairs if pairs else None
+
+    return {"within": share(rows), "within_unique_answer": share([row for row in rows if row["unique_answer"]])}
+
+
+def terminal_table(title: str, rows: list[dict[str, Any]], record: dict[str, Any]) -> Table:
+    """A row an object, then the shares over all of them."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("object", no_wrap=True)
+    table.add_column("class", no_wrap=True)
+    table.add_column(f"within {NEAR_DEGREES:g}°", justify="right")
+    table.add_column("relief", justify="right")
+    table.add_column("minima (degrees from the truth: height)", no_wrap=True)
+    for row in sorted(rows, key=lambda row: -row["within"]):
+        minima = ", ".join(f"{minimum['degrees']:+.0f}: {minimum['height']:.2f}" for minimum in row["minima"][:4])
+        table.add_row(row["object"], row["ambiguity"], f"{row['within']:.2f}", f"{row['relief']:.1%}", minima)
+    table.add_section()
+    for name, key in (("all objects", "within"), ("unique answer", "within_unique_answer")):
+        if record[key] is not None:
+            table.add_row(name, "", f"{record[key]:.3f}", "", "")
+    return table

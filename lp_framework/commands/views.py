@@ -1,0 +1,170 @@
+"""`views`: novel views around an object, as a prior draws them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from omegaconf import DictConfig
+from PIL import Image
+from rich.console import Console
+from torch import Tensor
+
+from lp_framework import registry
+from lp_framework.api import image_batch
+from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.device import choose_device
+from lp_framework.data.cache import tracked
+from lp_framework.data.photographs import BackgroundRemover, mask_files, on_white, prepare, read_image
+from lp_framework.errors import UserError, nearest
+from lp_framework.evaluation.tables import write_json
+from lp_framework.priors.base import Prior
+from lp_framework.viz.style import save_figure
+from lp_framework.viz.views import views_figure
+
+FOLDER = "views"
+
+
+class Source(NamedTuple):
+    """What is turned: its file, its name, and the prepared image (RGBA)."""
+
+    file: Path
+    name: str
+    image: Image.Image
+
+
+@orderly_console()
+def run(config: DictConfig) -> None:
+    """Write every view into `views/`, and `source.png`, `views.png`, `views.pdf` and `views.json`."""
+    folder = run_folder()
+    seed_run(config.seed)
+    latitudes, longitudes = angles(config.latitudes_degrees, config.longitudes)
+    check_sampling(config.steps, config.guidance, config.eta)
+    device = choose_device(config.accelerator)
+    source = photograph(config) if config.image is not None else data_view(config)
+    prior: Prior = registry.build("prior", config.prior).to(device)
+    (folder / FOLDER).mkdir(exist_ok=True)
+    save_png(folder / "source.png", source.image)
+
+    poses = grid(latitudes, longitudes)  # [rows, columns, 3]
+    code = prior.encode(image_batch([source.image]).to(device))
+    generator = torch.Generator().manual_seed(config.seed)  # on the CPU: a GPU gets the same draws
+    columns = []
+    for column in tracked(range(len(longitudes)), "views around the object"):
+        pose = poses[:, column].to(device)
+        repeated = code[torch.zeros(len(pose), dtype=torch.int64, device=device)]
+        images = prior.generate(repeated, pose, config.steps, config.guidance, generator, config.eta)
+        columns.append(pixels(images))
+        for row, view in enumerate(columns[-1]):
+            save_png(folder / FOLDER / file_name(latitudes[row], longitudes[column]), Image.fromarray(view))
+    views = np.stack(columns, axis=1)  # [rows, columns, h, w, 3]
+
+    settings = f"steps {config.steps}, guidance {config.guidance:g}, eta {config.eta:g}, seed {config.seed}"
+    figure = views_figure(
+        on_white(source.image), views, latitudes, longitudes, source.name, f"prior {config.prior.name}, {settings}"
+    )
+    save_figure(figure, folder / "views")
+    record = {
+        "source": str(source.file),
+        "views": records(latitudes, longitudes, poses),
+        "seed": config.seed,
+        "config": plain(config),
+        "versions": versions(),
+    }
+    write_json(folder / "views.json", record)
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(f"views:   {folder / FOLDER} ({views.shape[0] * views.shape[1]} files)")
+    console.print(f"poses:   {folder / 'views.json'}")
+    console.print(f"picture: {folder / 'views.png'}")
+
+
+def angles(latitudes: Sequence[float], count: int) -> tuple[list[float], list[float]]:
+    """The rows' relative latitudes and the columns' relative longitudes, degrees."""
+    if not isinstance(count, int) or count < 1:
+        raise UserError(f"longitudes must be a number of them, at least 1, got {count}")
+    chosen = list(latitudes) if isinstance(latitudes, Sequence) else []
+    in_range = all(isinstance(each, int | float) and -180 < each < 180 for each in chosen)
+    if not chosen or not in_range or len({*chosen}) < len(chosen):
+        raise UserError(f"latitudes_degrees must list different angles between -180 and 180, got {latitudes}")
+    return [float(each) for each in chosen], [360 * number / count for number in range(count)]
+
+
+def check_sampling(steps: int, guidance: float, eta: float) -> None:
+    """`UserError` for settings of DDIM that no prior has; what a prior allows beyond that it says itself."""
+    if not isinstance(steps, int) or steps < 1:
+        raise UserError(f"steps must be a whole number, at least 1, got {steps}")
+    if not isinstance(guidance, int | float) or not 0 <= guidance < float("inf"):
+        raise UserError(f"guidance must be a number, not negative, got {guidance}")
+    if not isinstance(eta, int | float) or not 0 <= eta <= 1:
+        raise UserError(f"eta must lie in [0, 1], got {eta}")
+
+
+def grid(latitudes: Sequence[float], longitudes: Sequence[float]) -> Tensor:
+    """Relative poses `[rows, columns, 3]` (radians, radius 0) of angles in degrees."""
+    degrees = torch.cartesian_prod(*(torch.tensor(each, dtype=torch.float64) for each in (latitudes, longitudes)))
+    poses = torch.cat([torch.deg2rad(degrees), torch.zeros(len(degrees), 1)], dim=1)
+    return poses.float().view(len(latitudes), len(longitudes), 3)
+
+
+def photograph(config: DictConfig) -> Source:
+    """The file that `image` names, prepared as a photograph is."""
+    file = Path(config.image)
+    image = read_image(file)
+    mask = None if config.masks is None else mask_files([file], config.masks)[0]
+    remover = BackgroundRemover() if config.remove_background else None
+    opened = None if mask is None else read_image(mask)
+    return Source(file, file.name, prepare(image, str(file), opened, remover, config.crop))
+
+
+def data_view(config: DictConfig) -> Source:
+    """The first test view of the data set's `object`, as it is."""
+    data = build_data(config)
+    data.evaluate_on("ordered", config.seed)
+    data.prepare_data()
+    table = data.table("test")
+    if config.object not in table.names:
+        known = f"{nearest(str(config.object), table.names)} (known: {', '.join(table.names)})"
+        raise UserError(f"data={config.data.name} has no object '{config.object}'{known}")
+    index = table.names.index(config.object)
+    file = table.files[table.views_of(index)[0]]
+    return Source(file, table.names[index].replace("_", " "), prepare(read_image(file), str(file), crop=False))
+
+
+def pixels(images: Tensor) -> NDArray[np.uint8]:
+    """Pixels `[B, H, W, 3]` of images `[B, 3, H, W]` in [-1, 1]."""
+    return ((images + 1) * 127.5).round().clamp(0, 255).byte().permute(0, 2, 3, 1).cpu().numpy()
+
+
+def file_name(latitude: float, longitude: float) -> str:
+    """The name of a view's file, of its relative angles in degrees.
+
+    >>> file_name(-20.0, 30.0)
+    'latitude-20_longitude030.png'
+    """
+    return f"latitude{latitude:+g}_longitude{longitude:03g}.png"
+
+
+def save_png(path: Path, image: Image.Image) -> None:
+    """Write an image whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    image.save(partial, "PNG")
+    os.replace(partial, path)
+
+
+def records(latitudes: Sequence[float], longitudes: Sequence[float], poses: Tensor) -> list[dict[str, object]]:
+    """For every view its file and its pose relative to the source."""
+    return [
+        {
+            "file": f"{FOLDER}/{file_name(latitude, longitude)}",
+            "relative_latitude_degrees": latitude,
+            "relative_longitude_degrees": round(longitude, 6),
+            "relative_pose": [round(value, 6) for value in poses[row, column].tolist()],
+        }
+        for row, latitude in enumerate(latitudes)
+        for column, longitude in enumerate(longitudes)
+    ]

@@ -1,0 +1,248 @@
+"""Photographs of one object, prepared as the priors and models know views: upright, cut out, centred, square, on white.
+
+Where the object is, an image's own alpha channel says, a mask file, or rembg. The crop is that of Zero123's demo
+(`load_and_preprocess`): the longest side of the object's bounding box becomes 200 of the image's 256 pixels, its centre
+the image's. Background is what is less than half opaque, as in the code of iFusion and ID-Pose.
+
+What a crop does to the camera: the prepared image is, nearly, that of a *virtual* camera with the field of view of the
+priors (49.1 degrees) at the same viewpoint, turned so that it looks at the object's centre, and moved along its line
+of sight until the object fills that share of the frame. Latitude and longitude are the photograph's, up to the
+perspective of an object off the image's centre or very near. The distance is not: how far away the real camera stood,
+and its focal length, are lost. A relative radius compares two virtual cameras, each of which sees the object fill the
+same share: it is about 0 where the object looks as large from both, negative where the query sees a shorter side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageOps
+
+from lp_framework.errors import UserError
+
+SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
+FIELD_OF_VIEW_DEGREES = 49.1  # of the virtual camera: that of the views on which the priors were trained
+HALF = 128  # opacity, of 255, from which on a pixel is the object's
+SMALLEST = 16  # pixels; a smaller object in a photograph says too little
+SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+
+
+# ---------------------------------------------------------------- files
+
+
+def photograph_files(images: str | Path | Sequence[str | Path]) -> list[Path]:
+    """The image files of a folder, sorted by name, or those of a list, as given; at least two, or a `UserError`."""
+    if isinstance(images, str | Path):
+        folder = Path(images)
+        if not folder.is_dir():
+            what = "is one image, two or more are needed" if folder.exists() else "there is no such folder"
+            raise UserError(f"images={folder}: {what}; give a list, images=[A.png,B.png], or a folder")
+        files = _images_in(folder)
+        if len(files) < 2:
+            known = ", ".join(SUFFIXES)
+            raise UserError(f"images={folder}: two or more images are needed, it holds {len(files)} ({known})")
+        return files
+    files = [Path(str(image)) for image in images]
+    if len(files) < 2:
+        raise UserError(
+            f"images: two or more files are needed, got {len(files)}; give images=[A.png,B.png] or a folder"
+        )
+    return files
+
+
+def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
+    """For every image its mask, the image of the same name in `folder` (with any suffix); None where there is none."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"masks={folder}: there is no such folder")
+    first: dict[str, Path] = {}
+    for file in files:
+        if first.setdefault(file.stem, file) != file:
+            raise UserError(
+                f"{first[file.stem]} and {file} have the same name, so {folder} cannot tell their masks apart"
+            )
+    masks = {mask.stem: mask for mask in reversed(_images_in(folder))}
+    return [masks.get(file.stem) for file in files]
+
+
+def _images_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != ".")
+
+
+# ---------------------------------------------------------------- reading
+
+
+def read_image(file: str | Path) -> Image.Image:
+    """An image file as `upright` has it; `UserError` naming the file where it cannot be read."""
+    try:
+        with Image.open(file) as image:
+            return upright(image)
+    except FileNotFoundError:
+        raise UserError(f"{file}: there is no such image") from None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise UserError(f"{file}: is not a readable image ({error})") from error
+
+
+def upright(image: Image.Image) -> Image.Image:
+    """An image of any mode, turned as its EXIF orientation says: RGBA where it has transparency, else RGB.
+
+    16-bit levels are scaled to 8 bits. Raises `ValueError` for a mode whose white is not known (floating point).
+    """
+    image = ImageOps.exif_transpose(image)
+    if image.mode == "F":
+        raise ValueError("its pixels are floating-point numbers; save it with 8 or 16 bits")
+    if image.mode.startswith("I"):  # Pillow's own conversion cuts off above 255
+        levels = np.asarray(image).astype(np.float64).clip(0, 65535) / 257
+        image = Image.fromarray(np.rint(levels).astype(np.uint8))
+    return image.convert("RGBA" if image.has_transparency_data else "RGB")
+
+
+def array_image(array: ArrayLike, name: str) -> Image.Image:
+    """The image of an array `[H, W, 3 | 4]`: uint8, or floats in [0, 1]."""
+    values: NDArray[Any] = np.asarray(array)
+    if values.ndim != 3 or values.shape[2] not in (3, 4) or not values.size:
+        raise UserError(f"{name} must be [H, W, 3] or [H, W, 4], got {list(values.shape)}")
+    if values.dtype != np.uint8:
+        if not (np.issubdtype(values.dtype, np.floating) and values.min() >= 0 and values.max() <= 1):
+            raise UserError(f"{name} must be uint8, or floats in [0, 1], got {values.dtype}")
+        values = np.rint(values * 255).astype(np.uint8)
+    return Image.fromarray(values)
+
+
+# ---------------------------------------------------------------- cutting out
+
+
+class BackgroundRemover:
+    """Finds the object by rembg (MIT licence) with the network U^2-Net (Apache-2.0).
+
+    It is loaded at the first image; rembg then downloads the weights (176 MB) unless it has done so before.
+    """
+
+    def mask(self, image: Image.Image) -> Image.Image:
+        """The object's opacity, "L", in an image."""
+        remove, session = self._rembg
+        mask: Image.Image = remove(image.convert("RGB"), session=session, only_mask=True)
+        return mask
+
+    @cached_property
+    def _rembg(self) -> tuple[Any, Any]:
+        try:
+            from rembg import new_session, remove
+        except (ImportError, SystemExit):  # without onnxruntime it exits
+            raise UserError("remove_background=true needs rembg: pip install 'lp_framework[masks]'") from None
+        try:
+            return remove, new_session("u2net")  # its default network is not free for commercial use
+        except (OSError, ValueError) as error:
+            raise UserError(f"the weights of rembg's u2net cannot be had ({error})") from error
+
+
+def cut_out(
+    image: Image.Image,
+    name: str,
+    mask: Image.Image | None = None,
+    remover: BackgroundRemover | None = None,
+    required: bool = True,
+) -> Image.Image:
+    """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else `remover`.
+
+    Where none of them is to be had that is a `UserError` if `required`, else the whole image is opaque. `UserError`,
+    too, for a mask of another size or without background; `name` is what errors call the image.
+    """
+    opacity = None
+    if mask is not None:
+        if mask.size != image.size:
+            raise UserError(
+                f"{name}: is {image.width} x {image.height} pixels but its mask is {mask.width} x {mask.height}"
+            )
+        opacity = _marked(mask)
+        if opacity is None:
+            raise UserError(f"{name}: its mask marks no background, which must be black")
+    elif image.mode == "RGBA":
+        opacity = _opacity(image.getchannel("A"))
+    if opacity is None and remover is not None:
+        opacity = _opacity(remover.mask(image))
+        if opacity is None:
+            raise UserError(f"{name}: rembg finds no background in it; give a mask")
+    if opacity is None and required:
+        raise UserError(
+            f"{name}: has no transparent background (alpha channel) and no mask; give masks=FOLDER or "
+            "remove_background=true, or crop=false if it shows the object on white already"
+        )
+    result = image.convert("RGB")
+    result.putalpha(255 if opacity is None else opacity)
+    return result
+
+
+def _marked(mask: Image.Image) -> Image.Image | None:
+    """What a mask marks: the opaque part of one with transparency, the bright part of any other."""
+    opacity = _opacity(mask.getchannel("A")) if mask.mode == "RGBA" else None
+    return opacity or _opacity(mask.convert("L"))
+
+
+def _opacity(levels: Image.Image) -> Image.Image | None:
+    """The opacity that an alpha channel or mask ("L") stands for; None where nothing is less than half opaque.
+
+    The least level is background: ID-Pose's cut-outs have 127 there. Of just two levels the other one is opaque, as in
+    masks of zeros and ones.
+    """
+    values = np.asarray(levels)
+    low, high = int(values.min()), int(values.max())
+    if low >= HALF:
+        return None
+    top = high if low < high and ((values == low) | (values == high)).all() else 255
+    stretched = (values.astype(np.float32) - low) * (255 / (top - low))
+    return Image.fromarray(np.rint(stretched).astype(np.uint8))
+
+
+# ---------------------------------------------------------------- framing
+
+
+def crop_to_object(image: Image.Image, name: str) -> Image.Image:
+    """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module).
+
+    What lies beyond the photograph is transparent.
+    """
+    box = image.getchannel("A").point([0] * HALF + [255] * (256 - HALF)).getbbox()
+    if box is None:
+        raise UserError(f"{name}: its mask is empty, nothing in it is at least half opaque")
+    left, top, right, bottom = box
+    longest = max(right - left, bottom - top)
+    if longest < SMALLEST:
+        raise UserError(f"{name}: the object is {longest} pixels long, at least {SMALLEST} are needed")
+    side = longest * SIZE / EXTENT
+    corners = np.array([left + right - side, top + bottom - side, left + right + side, top + bottom + side]) / 2
+    whole = (*(math.floor(corner) for corner in corners[:2]), *(math.ceil(corner) for corner in corners[2:]))
+    x0, y0, x1, y1 = (corners - np.tile(whole[:2], 2)).tolist()
+    return image.crop(whole).resize((SIZE, SIZE), Image.Resampling.LANCZOS, box=(x0, y0, x1, y1))
+
+
+def prepare(
+    image: Image.Image,
+    name: str,
+    mask: Image.Image | None = None,
+    remover: BackgroundRemover | None = None,
+    crop: bool = True,
+) -> Image.Image:
+    """A photograph prepared, RGBA of `SIZE` pixels a side; see `cut_out` and `crop_to_object`.
+
+    Without `crop` the whole image is kept, which must be square; one without background then shows the object on white.
+    """
+    if crop:
+        return crop_to_object(cut_out(image, name, mask, remover), name)
+    if image.width != image.height:
+        raise UserError(f"{name}: is {image.width} x {image.height} pixels; without crop an image must be square")
+    whole = cut_out(image, name, mask, remover, required=False)
+    return whole.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
+
+
+def on_white(image: Image.Image) -> NDArray[np.uint8]:
+    """Pixels `[H, W, 3]` of an RGBA image composed over white."""
+    white = Image.new("RGBA", image.size, "white")
+    white.alpha_composite(image)
+    return np.asarray(white.convert("RGB"))

@@ -1,0 +1,302 @@
+"""`estimate` and `estimate_pose`: pictures in, the solver's poses out, in every file and in the right order."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from colmap_reader import read_colmap
+from conftest import Finished
+from drawn_photographs import drawn, placed
+from matplotlib.image import imread
+from omegaconf import OmegaConf
+from PIL import Image
+from torch import Tensor
+
+import lp_framework
+from lp_framework.composition import conf_dir
+from lp_framework.data.photographs import on_white, prepare
+from lp_framework.errors import UserError
+from lp_framework.geometry import camera_to_world
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver
+
+SOLVER = '''
+    from __future__ import annotations
+
+    import math
+
+    import torch
+    from torch import Tensor
+
+    from lp_framework.registry import register
+    from lp_framework.solvers.base import Cost, Pairs, Solution, Solver
+
+
+    @register("solver", "tmp_brightness")
+    class Brightness(Solver):
+        """Tells a made-up longitude from how bright the query is; fails at images darker than `fails_below`."""
+
+        def __init__(self, latitude: float = 0.1, radius: float = 0.2, fails_below: float = -2.0) -> None:
+            self.latitude, self.radius, self.fails_below = latitude, radius, fails_below
+
+        def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+            assert pairs.images.shape[1:] == (3, 256, 256) and pairs.images.abs().max() <= 1
+            bright = pairs.images.mean(dim=(1, 2, 3))[pairs.query]
+            pose = torch.tensor([self.latitude, 3, self.radius]) + bright[:, None] * torch.tensor([0.0, 1.0, 0.0])
+            pose = pose.masked_fill(bright[:, None] < self.fails_below, math.nan)
+            energies = starts[..., 0].abs() + bright[:, None]  # least where a start's latitude is 0
+            return Solution(
+                poses=pose[:, None].expand_as(starts), energies=energies, valid=energies > -9,
+                chosen=energies.argmin(dim=1), cost=Cost(network_passes=7, seconds=0.5),
+            )
+'''
+
+
+@pytest.fixture
+def photos(tmp_path: Path, write: Callable[[str, str], Path]) -> Path:
+    """A folder with three photographs, darker from one to the next, where the solver above is a plugin."""
+    write("plugins/tmp_brightness/tmp_brightness.py", SOLVER)
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name, brightness in (("front", 1.0), ("left", 0.8), ("right", 0.5)):
+        image = drawn(80, 60)
+        image[..., :3] = image[..., :3] * brightness
+        placed(image, 30, 20).save(folder / f"{name}.png")
+    return folder
+
+
+def brightness(file: Path) -> float:
+    """What the solver sees."""
+    with Image.open(file) as image:
+        return float((on_white(image.convert("RGBA")) / 127.5 - 1).mean())
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "poses.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def estimate(lp: Callable[..., Finished], *overrides: str) -> Finished:
+    return lp("estimate", "solver=tmp_brightness", "hydra.run.dir=run", *overrides)
+
+
+# ---------------------------------------------------------------- the command
+
+
+def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
+    finished = estimate(lp, "images=photos", "latitude_degrees=10", "radius=1.5")
+    assert finished.status == 0, finished.err
+    run = tmp_path / "run"
+    files = [f"images/{index:03d}.png" for index in range(3)]
+    longitudes = [0.0] + [3 + brightness(run / file) for file in files[1:]]
+    made_up = [[math.radians(10) + 0.1, longitude, 1.7] for longitude in longitudes[1:]]
+    poses = torch.tensor([[math.radians(10), 0.0, 1.5], *made_up], dtype=torch.float64)
+    cameras = camera_to_world(poses)
+
+    table = rows(run)
+    assert [row["file"] for row in table] == [f"photos/{name}.png" for name in ("front", "left", "right")]
+    assert [row["image"] for row in table] == files
+    for row, pose, longitude in zip(table, poses.tolist(), longitudes, strict=True):
+        absolute = [float(row[key]) for key in ("latitude_degrees", "longitude_degrees", "radius")]
+        assert absolute == pytest.approx([math.degrees(pose[0]), math.degrees(pose[1]), pose[2]], abs=1e-3)
+        assert float(row["relative_longitude_degrees"]) == pytest.approx(math.degrees(longitude), abs=1e-3)
+        assert row["valid"] == "True"
+    assert [float(table[1][f"relative_{key}"]) for key in ("latitude_degrees", "radius")] == pytest.approx(
+        [math.degrees(0.1), 0.2], abs=1e-3
+    )
+    assert table[0]["energy"] == "" and float(table[2]["energy"]) == pytest.approx(longitudes[2] - 3, abs=1e-4)
+
+    transforms = json.loads((run / "transforms.json").read_text())
+    assert transforms["camera_angle_x"] == pytest.approx(math.radians(49.1))
+    assert [frame["file_path"] for frame in transforms["frames"]] == files
+    matrices = torch.tensor([frame["transform_matrix"] for frame in transforms["frames"]], dtype=torch.float64)
+    torch.testing.assert_close(matrices, cameras, rtol=0, atol=1e-6)
+
+    _, images = read_colmap({file.name: file.read_text() for file in (run / "colmap").iterdir()})
+    assert [image.name for image in images] == ["000.png", "001.png", "002.png"]
+    for image, camera in zip(images, cameras.numpy(), strict=True):
+        np.testing.assert_allclose(-image.rotation.T @ image.translation, camera[:3, 3], atol=1e-6)
+
+    for file, name in zip(files, ("front", "left", "right"), strict=True):
+        with Image.open(photos / f"{name}.png") as original, Image.open(run / file) as prepared:
+            assert np.array_equal(prepared, prepare(original, name)) and prepared.size == (256, 256)
+
+    results = json.loads((run / "results.json").read_text())
+    assert results["valid"] is True and results["checkpoint"] is None and results["seed"] == 0
+    assert results["network_passes"] == 7 and results["config"]["radius"] == 1.5
+    assert results["energies"][0][1] == pytest.approx(longitudes[1] - 3, abs=1e-4) and results["energies"][0][0] is None
+    assert imread(run / "cameras.png").shape[1] == 1600 and (run / "cameras.pdf").exists()
+
+    for line in ("front.png", "10.0°", "reference", f"{math.degrees(longitudes[2]):.1f}°", "run/cameras.png"):
+        assert line in finished.out
+
+
+def test_the_first_of_a_list_is_the_reference(lp, photos: Path, tmp_path: Path):
+    assert estimate(lp, "images=[photos/right.png,photos/front.png]").status == 0
+    table = rows(tmp_path / "run")
+    assert [row["file"] for row in table] == ["photos/right.png", "photos/front.png"]
+    assert [float(row["longitude_degrees"]) for row in table] == pytest.approx(
+        [0, math.degrees(3 + brightness(tmp_path / "run/images/001.png"))], abs=1e-3
+    )
+
+
+def test_masks_and_whole_views(lp, photos: Path, tmp_path: Path):
+    assert estimate(lp, "images=photos").status == 0
+    expected = [(tmp_path / f"run/images/{index:03d}.png").read_bytes() for index in range(3)]
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "plain").mkdir()
+    for file in photos.iterdir():
+        with Image.open(file) as image:
+            image.getchannel("A").save(tmp_path / "masks" / file.name)
+            image.convert("RGB").save(tmp_path / "plain" / f"{file.stem}.bmp")
+    assert "has no transparent background" in estimate(lp, "images=plain").error
+    assert estimate(lp, "images=plain", "masks=masks").status == 0
+    assert [(tmp_path / f"run/images/{index:03d}.png").read_bytes() for index in range(3)] == expected
+    assert "plain/front.bmp: is 300 x 200 pixels" in estimate(lp, "images=plain", "crop=false").error
+    for file in (tmp_path / "plain").iterdir():
+        with Image.open(file) as image:
+            image.crop((0, 0, 128, 128)).save(file)
+    assert estimate(lp, "images=plain", "crop=false").status == 0
+    with Image.open(tmp_path / "run/images/000.png") as image, Image.open(tmp_path / "plain/front.bmp") as whole:
+        assert np.array_equal(image.convert("RGB"), whole.resize((256, 256), Image.Resampling.LANCZOS))
+
+
+def test_an_image_without_a_pose_is_left_out_and_named(lp, photos: Path, tmp_path: Path):
+    assert estimate(lp, "images=photos").status == 0
+    run = tmp_path / "run"
+    between = sum(brightness(run / f"images/{index:03d}.png") for index in (1, 2)) / 2
+    finished = estimate(lp, "images=photos", f"solver.fails_below={between}")
+    assert finished.status == 0
+    assert "photos/right.png: the solver found no pose" in finished.err
+    assert [row["valid"] for row in rows(run)] == ["True", "True", "False"]
+    transforms = json.loads((run / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in transforms["frames"]] == ["images/000.png", "images/001.png"]
+    assert "002.png" not in (run / "colmap/images.txt").read_text()
+
+
+def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path):
+    assert estimate(lp, "images=photos", "solver.radius=-1.5").status == 0
+    assert [row["valid"] for row in rows(tmp_path / "run")] == ["True", "False", "False"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error"),
+    [
+        ([], "images needs a value: give images=VALUE"),
+        (["images=photos/front.png"], "photos/front.png: is one image, two or more are needed"),
+        (["images=[photos/front.png,photos/none.png]"], "photos/none.png: there is no such image"),
+        (["images=[photos/front.png,photos/broken.png]"], "photos/broken.png: is not a readable image"),
+        (["images=photos", "masks=none"], "masks=none: there is no such folder"),
+        (["images=photos", "crop=perhaps"], "crop must be true or false, got perhaps"),
+        (["images=photos", "radius=0"], "radius must be a positive number, got 0"),
+        (["images=photos", "latitude_degrees=90"], "latitude_degrees must lie between -90 and 90, got 90"),
+        (["images=photos", "accelerator=tpu"], "accelerator=tpu cannot be had here"),
+    ],
+)
+def test_mistakes_are_met_before_any_model_is_loaded(lp, photos, overrides, error, tmp_path, monkeypatch):
+    if "broken" in str(overrides):
+        (photos / "broken.png").write_bytes((photos / "front.png").read_bytes()[:400])
+    monkeypatch.setattr("lp_framework.commands.estimate.build_solver", lambda config: pytest.fail("too early"))
+    finished = estimate(lp, *overrides)
+    assert finished.status == 1 and error in finished.error
+
+
+def test_the_function_has_the_defaults_of_the_command():
+    config = OmegaConf.load(conf_dir() / "estimate.yaml")
+    chosen = {key: value for each in config.defaults if not isinstance(each, str) for key, value in each.items()}
+    defaults = {
+        key: parameter.default
+        for key, parameter in inspect.signature(lp_framework.estimate_pose).parameters.items()
+        if parameter.default is not inspect.Parameter.empty
+    }
+    assert (defaults.pop("solver"), defaults.pop("prior"), defaults.pop("starts"), defaults.pop("model")) == (
+        chosen["solver"], chosen["prior"], chosen["start"], config.checkpoint,
+    )  # fmt: skip
+    assert defaults == {key: config[key] for key in defaults}
+
+
+# ---------------------------------------------------------------- the function
+
+
+class Recorder(Solver):
+    """Keeps what it is given; the answer is the start of most latitude."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[Pairs, Tensor, int]] = []
+
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        self.seen.append((pairs, starts, seed))
+        energies = -starts[..., 0]
+        cost = Cost(network_passes=0, seconds=0.0)
+        return Solution(starts, energies, energies.isfinite(), energies.argmin(dim=1), cost)
+
+
+def test_files_arrays_and_images_are_the_same_pictures(tmp_path: Path):
+    images = [placed(drawn(80, 60), 30, 20), placed(drawn(40, 60), 3, 2)]
+    files = [tmp_path / "a.png", tmp_path / "b.png"]
+    for image, file in zip(images, files, strict=True):
+        image.save(file)
+    recorder = Recorder()
+    arrays = [np.asarray(image) for image in images]
+    for reference, query in (files, map(str, files), images, arrays, [array / 255 for array in arrays]):
+        lp_framework.estimate_pose(reference, query, solver=recorder, seed=5)
+    expected = np.stack([on_white(prepare(image, "a")) for image in images])
+    for pairs, starts, seed in recorder.seen:
+        pixels = ((pairs.images + 1) * 127.5).round().permute(0, 2, 3, 1)
+        np.testing.assert_array_equal(pixels.numpy(), expected)
+        assert pairs.reference.tolist() == [0] and pairs.query.tolist() == [1]
+        assert starts.shape == (1, 9, 3) and seed == 5
+
+
+def test_starts_by_name_or_built():
+    image = placed(drawn(), 30, 20)
+    recorder = Recorder()
+    ring = lp_framework.make_starts("ring", count=5, latitude=0.3)
+    lp_framework.estimate_pose(image, image, solver=recorder, starts="ring")
+    solution = lp_framework.estimate_pose(image, image, solver=recorder, starts=ring)
+    assert [starts.shape[1] for _, starts, _ in recorder.seen] == [4, 5]
+    assert solution.answer()[0, 0] == pytest.approx(0.3)
+
+
+def test_the_views_of_a_rendering_are_taken_whole():
+    recorder = Recorder()
+    view = placed(drawn(80, 60), 30, 20, 256, 256)
+    lp_framework.estimate_pose(view, view, solver=recorder, crop=False)
+    np.testing.assert_array_equal(
+        ((recorder.seen[0][0].images[0] + 1) * 127.5).round().permute(1, 2, 0), on_white(view)
+    )
+
+
+def test_mistakes_name_the_picture():
+    recorder, image = Recorder(), placed(drawn(), 30, 20)
+    for query, error in (
+        (image.convert("RGB"), "query: has no transparent background"),
+        ("none.png", r"none\.png: there is no such image"),
+        (np.zeros((4, 4)), r"query must be \[H, W, 3\] or"),
+        (Image.fromarray(np.zeros((4, 4), dtype=np.float32)), "query: its pixels are floating-point numbers"),
+    ):
+        with pytest.raises(UserError, match=error):
+            lp_framework.estimate_pose(image, query, solver=recorder)
+    with pytest.raises(UserError, match="there is no solver 'two_stages'; did you mean 'two_stage'"):
+        lp_framework.estimate_pose(image, image, solver="two_stages")
+    with pytest.raises(UserError, match="there is no start 'grit'; did you mean 'grid'"):
+        lp_framework.estimate_pose(image, image, solver=recorder, starts="grit")
+
+
+def test_it_works_out_of_the_box_and_names_mean_what_they_do_elsewhere():
+    reference, query = placed(drawn(80, 60), 30, 20), placed(drawn(60, 80), 30, 20)
+    solution = lp_framework.estimate_pose(reference, query)
+    assert solution.poses.shape == (1, 9, 3) and solution.valid.all() and solution.answer().isfinite().all()
+    model = lp_framework.load_model(Path(lp_framework.__file__).parent / "weights" / "score")
+    solver = lp_framework.load_solver("two_stage", model=model, prior=lp_framework.load_prior("tiny"))
+    built = lp_framework.estimate_pose(
+        reference, query, solver=solver, starts=lp_framework.make_starts("grid"), prior="tiny", model=model
+    )
+    torch.testing.assert_close(built.poses, solution.poses)

@@ -1,0 +1,407 @@
+"""Photographs: read whatever they are, cut out, framed alike wherever the object stands, and every mistake told."""
+
+from __future__ import annotations
+
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_photographs import drawn, placed
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from lp_framework.data.cache import decoded_views
+from lp_framework.data.photographs import (
+    EXTENT,
+    SIZE,
+    BackgroundRemover,
+    array_image,
+    crop_to_object,
+    cut_out,
+    mask_files,
+    on_white,
+    photograph_files,
+    prepare,
+    read_image,
+    upright,
+)
+from lp_framework.errors import UserError
+
+SAMPLES = Path(__file__).parents[1].parent / "shared" / "samples" / "photos"
+
+
+def object_box(image: Image.Image) -> tuple[int, int, int, int]:
+    box = Image.fromarray((np.asarray(image)[..., 3] >= 128).astype(np.uint8) * 255).getbbox()
+    assert box is not None
+    return box
+
+
+def saved(image: Image.Image, file: Path, **options) -> Path:
+    image.save(file, **options)
+    return file
+
+
+# ---------------------------------------------------------------- framing
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 240), st.integers(0, 160))
+def test_where_the_object_stands_makes_no_difference(left: int, top: int):
+    expected = crop_to_object(placed(drawn(), 120, 80), "a")
+    assert np.array_equal(crop_to_object(placed(drawn(), left, top), "a"), expected)
+
+
+def test_how_large_the_object_is_makes_no_difference_but_for_resampling():
+    expected = on_white(crop_to_object(placed(drawn(), 10, 10), "a")).astype(int)
+    for scale in (2, 3, 5):
+        larger = on_white(crop_to_object(placed(drawn(scale=scale), 0, 0, 400, 300), "a")).astype(int)
+        difference = np.abs(larger - expected)
+        assert difference.mean() < 1.5 and np.median(difference) <= 1
+
+
+@pytest.mark.parametrize(("width", "height"), [(60, 40), (40, 60), (50, 50), (500, 20)])
+def test_the_object_is_centred_and_its_longest_side_fills_the_published_share(width: int, height: int):
+    prepared = crop_to_object(placed(drawn(width, height), 3, 5, 600, 100), "a")
+    assert prepared.size == (SIZE, SIZE) == (256, 256) and EXTENT == 200
+    left, top, right, bottom = object_box(prepared)
+    pixel = EXTENT / max(width, height)  # one of the photograph
+    assert abs(max(right - left, bottom - top) - EXTENT) <= pixel + 2
+    assert abs(left + right - SIZE) <= 2 and abs(top + bottom - SIZE) <= 2
+    source = object_box(Image.fromarray(drawn(width, height)))
+    ratio = (source[2] - source[0]) / (source[3] - source[1])  # the shape is kept
+    assert (right - left) / (bottom - top) == pytest.approx(ratio, rel=0.1)
+
+
+def test_hidden_colours_do_not_show_and_the_background_is_white():
+    image = drawn()
+    hidden = image.copy()
+    hidden[hidden[..., 3] == 0, :3] = [0, 255, 0]
+    expected = on_white(crop_to_object(placed(image, 20, 20), "a"))
+    np.testing.assert_array_equal(on_white(crop_to_object(placed(hidden, 20, 20), "a")), expected)
+    assert (expected[0] == 255).all() and (expected[:, -1] == 255).all()
+
+
+def test_on_white_is_straight_alpha():
+    image = np.array([[[200, 100, 0, 255], [200, 100, 0, 0], [200, 100, 0, 51]]], dtype=np.uint8)
+    assert on_white(Image.fromarray(image)).tolist() == [[[200, 100, 0], [255, 255, 255], [244, 224, 204]]]
+
+
+def test_without_crop_a_rendered_view_is_what_evaluation_sees(tmp_path: Path):
+    file = saved(placed(drawn(200, 100), 13, 60, 256, 256), tmp_path / "view.png")
+    prepared = prepare(read_image(file), "view", crop=False)
+    _, decoded = decoded_views([file], SIZE, tmp_path / "cache")
+    np.testing.assert_array_equal(on_white(prepared), decoded[0])
+
+
+def test_without_crop_an_image_without_background_is_taken_whole():
+    image = Image.fromarray(drawn(64, 64)[..., :3])
+    prepared = prepare(image, "a", crop=False)
+    np.testing.assert_array_equal(on_white(prepared), np.asarray(image.resize((SIZE, SIZE), Image.Resampling.LANCZOS)))
+    opaque = image.copy()
+    opaque.putalpha(255)
+    assert np.array_equal(prepare(opaque, "a", crop=False), prepared)
+    with pytest.raises(UserError, match="a: is 64 x 32 pixels; without crop an image must be square"):
+        prepare(image.crop((0, 0, 64, 32)), "a", crop=False)
+
+
+# ---------------------------------------------------------------- masks
+
+
+def in_modes(alpha: NDArray[np.uint8]) -> dict[str, Image.Image]:
+    """A mask of two levels as people save them."""
+    mask = alpha >= 128
+    palette = Image.fromarray(mask.astype(np.uint8)).convert("P")
+    palette.putpalette([0, 0, 0, 128, 0, 0] + [0] * 756)  # dark red, as segmentation sets have it
+    cutout = Image.new("RGBA", mask.shape[::-1], (9, 9, 9, 0))
+    cutout.paste((9, 9, 9, 255), mask=Image.fromarray(mask))
+    return {
+        "grey": Image.fromarray(mask.astype(np.uint8) * 255),
+        "one bit": Image.fromarray(mask),
+        "zeros and ones": Image.fromarray(mask.astype(np.uint8)),
+        "colour": Image.fromarray(mask.astype(np.uint8) * 255).convert("RGB"),
+        "palette": palette,
+        "16 bits": Image.fromarray(mask.astype(np.uint16) * 65535),
+        "cut-out": cutout,
+    }
+
+
+@pytest.mark.parametrize("mode", in_modes(drawn()[..., 3]))
+def test_a_mask_file_does_what_the_same_alpha_channel_does(mode: str, tmp_path: Path):
+    image = np.asarray(placed(drawn(), 20, 30)).copy()
+    mask = saved(in_modes(image[..., 3])[mode], tmp_path / "mask.png")
+    image[..., 3] = np.where(image[..., 3] >= 128, 255, 0)
+    expected = prepare(Image.fromarray(image), "a")
+    photograph = Image.fromarray(image[..., :3])
+    assert np.array_equal(prepare(photograph, "a", read_image(mask)), expected)
+    photograph.putalpha(255)
+    assert np.array_equal(prepare(photograph, "a", read_image(mask)), expected)
+
+
+def test_soft_masks_keep_their_edges():
+    image = placed(drawn(), 20, 30)
+    assert np.array_equal(prepare(image.convert("RGB"), "a", image.getchannel("A").convert("RGB")), prepare(image, "a"))
+
+
+def test_a_mask_comes_before_the_alpha_channel():
+    image = placed(drawn(), 20, 30)
+    mask = Image.new("RGB", image.size)
+    mask.paste("white", (40, 40, 60, 60))
+    assert object_box(cut_out(image, "a", mask)) == (40, 40, 60, 60)
+
+
+def test_the_least_opacity_is_background():
+    """ID-Pose's cut-outs are 127 there."""
+    image = np.asarray(placed(drawn(), 20, 30)).copy()
+    image[..., 3] = np.where(image[..., 3] >= 128, 255, 0)
+    expected = prepare(Image.fromarray(image), "a")
+    image[image[..., 3] == 0] = [0, 0, 0, 127]
+    assert np.array_equal(prepare(Image.fromarray(image), "a"), expected)
+
+
+# ---------------------------------------------------------------- reading
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_the_orientation_of_the_camera_is_honoured(orientation: int, suffix: str, tmp_path: Path):
+    right = Image.fromarray(np.kron(np.array([[250, 10, 80], [120, 200, 40]]), np.ones((16, 16))).astype(np.uint8))
+    # What EXIF says has been done to the sensor's rows, undone.
+    undo = {
+        2: [Image.Transpose.FLIP_LEFT_RIGHT], 3: [Image.Transpose.ROTATE_180], 4: [Image.Transpose.FLIP_TOP_BOTTOM],
+        5: [Image.Transpose.TRANSPOSE], 6: [Image.Transpose.ROTATE_90], 7: [Image.Transpose.TRANSVERSE],
+        8: [Image.Transpose.ROTATE_270],
+    }.get(orientation, [])  # fmt: skip
+    stored = right
+    for step in undo:
+        stored = stored.transpose(step)
+    exif = Image.Exif()
+    exif[274] = orientation
+    file = saved(stored, tmp_path / f"a.{suffix}", exif=exif)
+    image = read_image(file)
+    assert image.mode == "RGB" and image.size == right.size
+    np.testing.assert_allclose(np.asarray(image)[..., 0].astype(int), np.asarray(right).astype(int), atol=6)
+    with Image.open(file) as opened:
+        assert np.array_equal(upright(opened), image)
+
+
+GREY = np.array([[0, 64], [128, 255]], dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("image", "mode"),
+    [
+        (Image.fromarray(GREY), "RGB"),
+        (Image.fromarray(GREY.astype(np.uint16) * 257), "RGB"),
+        (Image.fromarray(GREY.astype(np.int32) * 257), "RGB"),
+        (Image.fromarray(GREY).convert("LA"), "RGBA"),
+        (Image.fromarray(GREY).convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE), "RGB"),
+        (Image.fromarray(GREY).convert("RGBA"), "RGBA"),
+    ],
+    ids=["grey", "16 bits", "32 bits", "grey with alpha", "palette", "RGBA"],
+)
+def test_modes_are_read_with_their_levels(image: Image.Image, mode: str, tmp_path: Path):
+    suffix = "tif" if image.mode == "I" else "png"
+    read = read_image(saved(image, tmp_path / f"a.{suffix}"))
+    assert read.mode == mode
+    np.testing.assert_array_equal(np.asarray(read)[..., 0], GREY)
+    np.testing.assert_array_equal(np.asarray(read)[..., 2], GREY)
+
+
+def test_a_transparent_palette_colour_is_background(tmp_path: Path):
+    image = Image.fromarray((drawn()[..., 3] >= 128).astype(np.uint8)).convert("P")
+    image.putpalette([255, 0, 255, 10, 20, 30] + [0] * 756)
+    frame = Image.new("P", (100, 100))
+    frame.putpalette(image.getpalette())
+    frame.paste(image, (20, 20))
+    file = saved(frame, tmp_path / "a.png", transparency=0)
+    prepared = prepare(read_image(file), "a")
+    assert prepared.getpixel((0, 0))[3] == 0 and prepared.getpixel((128, 128)) == (10, 20, 30, 255)
+
+
+def test_cmyk_photographs_are_read(tmp_path: Path):
+    image = Image.new("RGB", (8, 8), (200, 100, 50)).convert("CMYK")
+    read = read_image(saved(image, tmp_path / "a.jpg", quality=100))
+    np.testing.assert_allclose(np.asarray(read)[4, 4], [200, 100, 50], atol=4)
+
+
+def test_arrays_are_images():
+    levels = drawn()
+    assert np.array_equal(array_image(levels, "a"), levels)
+    assert np.array_equal(array_image(levels / 255, "a"), levels)
+    assert array_image(levels[..., :3].astype(np.float32) / 255, "a").mode == "RGB"
+
+
+@pytest.mark.parametrize(
+    ("array", "error"),
+    [
+        (np.zeros((4, 4)), r"a must be \[H, W, 3\] or \[H, W, 4\], got \[4, 4\]"),
+        (np.zeros((3, 4, 5)), r"got \[3, 4, 5\]"),
+        (np.zeros((0, 4, 3)), r"got \[0, 4, 3\]"),
+        (np.full((4, 4, 3), 2.0), r"a must be uint8, or floats in \[0, 1\]"),
+        (np.full((4, 4, 3), np.nan), r"floats in \[0, 1\]"),
+        (np.zeros((4, 4, 3), dtype=np.int64), r"a must be uint8, or floats in \[0, 1\], got int64"),
+    ],
+)
+def test_arrays_that_are_no_images(array, error: str):
+    with pytest.raises(UserError, match=error):
+        array_image(array, "a")
+
+
+# ---------------------------------------------------------------- mistakes
+
+
+def test_files_that_are_no_images(tmp_path: Path):
+    with pytest.raises(UserError, match=r"none\.png: there is no such image$"):
+        read_image(tmp_path / "none.png")
+    (tmp_path / "text.png").write_text("not an image")
+    whole = saved(Image.fromarray(drawn(200, 200)), tmp_path / "whole.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    for name in ("text.png", "cut.png"):
+        with pytest.raises(UserError, match=rf"{name}: is not a readable image \("):
+            read_image(tmp_path / name)
+    with pytest.raises(UserError, match="is not a readable image"):
+        read_image(tmp_path)
+    floats = saved(Image.fromarray(np.zeros((4, 4), dtype=np.float32)), tmp_path / "float.tif")
+    with pytest.raises(UserError, match=r"float\.tif: is not a readable image \(its pixels are floating-point numbers"):
+        read_image(floats)
+
+
+def test_objects_that_are_not_there():
+    image = Image.new("RGB", (60, 40))
+    black = Image.new("RGB", (60, 40))
+    with pytest.raises(UserError, match="a: its mask is empty, nothing in it is at least half opaque"):
+        prepare(image, "a", black)
+    with pytest.raises(UserError, match="a: its mask is empty"):
+        prepare(Image.new("RGBA", (60, 40)), "a")
+    small = black.copy()
+    small.paste("white", (10, 10, 25, 12))
+    with pytest.raises(UserError, match="a: the object is 15 pixels long, at least 16 are needed"):
+        prepare(image, "a", small)
+    small.paste("white", (10, 10, 26, 12))
+    prepare(image, "a", small)
+    with pytest.raises(UserError, match="a: its mask marks no background, which must be black"):
+        prepare(image, "a", Image.new("RGB", (60, 40), "white"))
+    with pytest.raises(UserError, match="a: is 60 x 40 pixels but its mask is 40 x 60"):
+        prepare(image, "a", Image.new("RGB", (40, 60)))
+
+
+@pytest.mark.parametrize("alpha", [None, 255, 128])
+def test_an_image_without_mask_says_what_to_do(alpha: int | None):
+    image = Image.new("RGB", (60, 40))
+    if alpha is not None:
+        image.putalpha(alpha)
+    with pytest.raises(UserError) as error:
+        prepare(image, "a.jpg")
+    assert str(error.value) == (
+        "a.jpg: has no transparent background (alpha channel) and no mask; give masks=FOLDER or "
+        "remove_background=true, or crop=false if it shows the object on white already"
+    )
+
+
+def test_photographs_are_those_of_a_folder_by_name_or_of_a_list_as_given(tmp_path: Path):
+    image = Image.fromarray(drawn())
+    for name in ("b.png", "a.PNG", "c.webp", ".hidden.png"):
+        image.save(tmp_path / name)
+    (tmp_path / "notes.txt").touch()
+    assert [file.name for file in photograph_files(tmp_path)] == ["a.PNG", "b.png", "c.webp"]
+    assert photograph_files(["z.png", "a.png"]) == [Path("z.png"), Path("a.png")]
+
+
+def test_too_few_photographs(tmp_path: Path):
+    saved(Image.fromarray(drawn()), tmp_path / "a.png")
+    for images, error in (
+        (["a.png"], r"images: two or more files are needed, got 1; give images=\[A\.png,B\.png\] or a folder"),
+        (tmp_path, rf"images={tmp_path}: two or more images are needed, it holds 1 \(\.bmp, "),
+        (tmp_path / "none", "none: there is no such folder; give a list"),
+        (str(tmp_path / "a.png"), "a.png: is one image, two or more are needed"),
+    ):
+        with pytest.raises(UserError, match=error):
+            photograph_files(images)
+
+
+def test_masks_are_found_by_name(tmp_path: Path):
+    for name in ("a.png", "b.tif", "other.png"):
+        Image.fromarray(drawn()[..., 3]).save(tmp_path / name)
+    files = [Path("photos/a.jpg"), Path("photos/b.jpg"), Path("photos/c.jpg")]
+    assert mask_files(files, tmp_path) == [tmp_path / "a.png", tmp_path / "b.tif", None]
+    with pytest.raises(UserError, match=r"masks=none: there is no such folder"):
+        mask_files(files, "none")
+    with pytest.raises(
+        UserError, match=r"x/a\.jpg and y/a\.jpg have the same name, so .* cannot tell their masks apart"
+    ):
+        mask_files([Path("x/a.jpg"), Path("y/a.jpg")], tmp_path)
+
+
+# ---------------------------------------------------------------- background removal
+
+
+@pytest.fixture
+def rembg(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """A stand-in that marks the brightest half, and keeps what it was asked."""
+    module = types.ModuleType("rembg")
+    module.sessions, module.modes = [], []  # type: ignore[attr-defined]
+
+    def new_session(name: str) -> str:
+        module.sessions.append(name)  # type: ignore[attr-defined]
+        return f"session {name}"
+
+    def remove(image: Image.Image, session: str, only_mask: bool) -> Image.Image:
+        assert session == "session u2net" and only_mask
+        module.modes.append(image.mode)  # type: ignore[attr-defined]
+        return image.convert("L").point([0] * 128 + [255] * 128)
+
+    module.new_session, module.remove = new_session, remove  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "rembg", module)
+    return module
+
+
+def test_the_background_is_removed_where_nothing_else_tells(rembg):
+    remover = BackgroundRemover()
+    cut = placed(drawn(), 20, 30)
+    assert np.array_equal(prepare(cut, "a", remover=remover), prepare(cut, "a"))
+    assert rembg.sessions == []  # its network is not even loaded
+    photograph = Image.new("RGB", (100, 80), (20, 30, 40))
+    photograph.paste((250, 240, 230), (30, 20, 70, 60))
+    mask = photograph.convert("L").point([0] * 128 + [255] * 128).convert("RGB")
+    for _ in range(2):
+        assert np.array_equal(prepare(photograph, "a", remover=remover), prepare(photograph, "a", mask))
+    opaque = photograph.convert("RGBA")
+    assert np.array_equal(prepare(opaque, "a", remover=remover), prepare(photograph, "a", mask))
+    assert rembg.sessions == ["u2net"] and rembg.modes == ["RGB"] * 3
+
+
+def test_what_can_go_wrong_with_background_removal(rembg, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(UserError, match="a: rembg finds no background in it; give a mask"):
+        prepare(Image.new("RGB", (60, 40), "white"), "a", remover=BackgroundRemover())
+    with pytest.raises(UserError, match="a: its mask is empty"):
+        prepare(Image.new("RGB", (60, 40)), "a", remover=BackgroundRemover())
+
+    def offline(name: str) -> None:
+        raise ConnectionError("no route to host")
+
+    rembg.new_session = offline
+    with pytest.raises(UserError, match=r"the weights of rembg's u2net cannot be had \(no route to host\)"):
+        prepare(Image.new("RGB", (60, 40)), "a", remover=BackgroundRemover())
+    monkeypatch.setitem(sys.modules, "rembg", None)  # as if not installed
+    with pytest.raises(UserError, match=r"remove_background=true needs rembg: pip install 'lp_framework\[masks\]'"):
+        prepare(Image.new("RGB", (60, 40)), "a", remover=BackgroundRemover())
+
+
+# ---------------------------------------------------------------- real photographs
+
+
+@pytest.mark.skipif(not SAMPLES.is_dir(), reason="the sample photographs are not part of the project")
+@pytest.mark.parametrize(
+    "name", ["cat/0.png", "sorter/1.png", "chair_photo/images/000.png", "toyduck_photo/images/004.png"]
+)
+def test_published_cut_outs_are_framed(name: str):
+    prepared = prepare(read_image(SAMPLES / name), name)
+    left, top, right, bottom = object_box(prepared)
+    assert abs(max(right - left, bottom - top) - EXTENT) <= 2 and abs(left + right - SIZE) <= 2
+    corners = np.asarray(prepared)[[0, 0, -1, -1], [0, -1, 0, -1], 3]
+    assert (corners == 0).all()
+    assert (on_white(prepared)[:20] == 255).all()
