@@ -1,0 +1,316 @@
+"""ID-Pose (Cheng et al. 2023): candidates are probed, the best descend a little, the very best far."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lp_framework.errors import UserError
+from lp_framework.geometry import wrap_angle
+from lp_framework.keyed_random import keyed_uniform
+from lp_framework.priors.base import Prior
+from lp_framework.registry import register
+from lp_framework.solvers.base import (
+    Cost,
+    Pairs,
+    Solution,
+    Solver,
+    ViewSets,
+    ViewSolution,
+    check_starts,
+    check_view_starts,
+    choose,
+)
+from lp_framework.solvers.descent import GradientDescent, descend
+from lp_framework.solvers.pair_energy import PairEnergy, keyed_noise
+
+_REFINEMENT = 0x4944  # separates the draws of the refinement from those of the exploration under the same seed
+
+
+class Candidates(NamedTuple):
+    """The K best of B pairs, best first: `poses` `[B, K, 3]`, their probed `energies` `[B, K]` (NaN where the prior
+    failed), `path` `[B, K, steps, 3]` on which they came there."""
+
+    poses: Tensor
+    energies: Tensor
+    path: Tensor
+
+
+class Refined(NamedTuple):
+    """The answers `[S, V - 1, 3]` of S sets, `valid` `[S]`, and the `path` `[S, steps + 1, V - 1, 3]`."""
+
+    poses: Tensor
+    valid: Tensor
+    path: Tensor
+
+
+@register("solver", "id_pose")
+class IDPose(Solver):
+    """ID-Pose: probes a grid of candidates, then plain gradient descent on the spherical pose, one direction a step.
+
+    Defaults are the published settings. Candidates are `longitudes` evenly around times `latitudes_degrees` (relative;
+    fewer where the elevations of the images are known), or with `candidates=starts` the given starts; otherwise
+    **starts are ignored**. All are probed in both directions with `probes` fixed noises at timesteps from `timestep`
+    to `timestep + timestep_span` (shares of the prior's range). The better half descends by `exploration_steps`, is
+    probed again, and the `kept` best stay. Among more than two images a candidate is judged by how well it goes with
+    the others' (triangular selection). The chosen ones descend by `refinement_steps` for each unknown image, with
+    fresh noise, at `timestep`; the answer is the mean of the last `averaged` poses before an update.
+
+    A `Solution` has the kept candidates as its N: the chosen one refined, the others as explored; the energies are
+    those of the candidates before refinement, by which it was chosen.
+
+    The published code reads the raw weights of a checkpoint: `prior.weights=raw`. Its rates are for Zero123's energy.
+    Plain gradient descent diverges where rate times curvature passes 2: `prior=tiny`, whose valleys are steeper, wants
+    `exploration_rate=0.3 refinement_rate=0.03`.
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        candidates: Literal["grid", "starts"] = "grid",
+        longitudes: int = 8,
+        latitudes_degrees: Sequence[float] = (-120.0, -60.0, 0.0, 60.0, 120.0),
+        timestep: float = 0.2,
+        timestep_span: float = 0.01,
+        probes: int = 16,
+        exploration_steps: int = 10,
+        exploration_rate: float = 10.0,
+        kept: int = 5,
+        refinement_steps: int = 600,
+        refinement_rate: float = 1.0,
+        averaged: int = 20,
+        trajectory: bool = False,
+    ) -> None:
+        for name, value, fits, wanted in (
+            ("longitudes", longitudes, longitudes >= 1, "at least 1"),
+            ("latitudes_degrees", latitudes_degrees, len(latitudes_degrees) >= 1, "one angle or more"),
+            ("timestep", timestep, 0 <= timestep < 1, "in [0, 1)"),
+            ("timestep_span", timestep_span, 0 <= timestep_span <= 1 - timestep, "from 0 to 1 - timestep"),
+            ("probes", probes, probes >= 1, "at least 1"),
+            ("exploration_steps", exploration_steps, exploration_steps >= 0, "at least 0"),
+            ("exploration_rate", exploration_rate, exploration_rate > 0, "positive"),
+            ("kept", kept, kept >= 1, "at least 1"),
+            ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"),
+            ("refinement_rate", refinement_rate, refinement_rate > 0, "positive"),
+            ("averaged", averaged, averaged >= 1, "at least 1"),
+        ):
+            if not fits:
+                raise UserError(f"solver.{name} must be {wanted}, got {value}")
+        self.prior, self.candidates, self.longitudes = prior, candidates, longitudes
+        self.latitudes = [math.radians(each) for each in latitudes_degrees]
+        self.timestep = int(timestep * prior.num_timesteps)
+        shares = [timestep + timestep_span * number / probes for number in range(probes)]
+        self.probe_timesteps = [int(share * prior.num_timesteps) for share in shares]
+        self.exploration_steps, self.exploration_rate, self.kept = exploration_steps, exploration_rate, kept
+        self.refinement_steps, self.refinement_rate, self.averaged = refinement_steps, refinement_rate, averaged
+        self.trajectory = trajectory
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        """See `Solver.solve` and the class."""
+        check_starts(pairs, starts)
+        began = time.perf_counter()
+        energy = PairEnergy(self.prior, pairs, seed)
+        found = self._explore(energy, starts)
+        chosen = choose(found.energies)
+        row = torch.arange(len(pairs), device=chosen.device)
+        views = torch.stack([pairs.reference, pairs.query], dim=1)
+        refined = self._refine(energy, views, pairs.ids, found.poses[row, chosen][:, None])
+        poses, valid = found.poses.clone(), found.energies.isfinite()
+        poses[row, chosen] = refined.poses[:, 0]
+        valid[row, chosen] &= refined.valid
+        path = None
+        if self.trajectory:
+            rest = found.path[:, :, -1:].expand(-1, -1, refined.path.shape[1] - 1, -1).clone()
+            rest[row, chosen] = refined.path[:, 1:, 0]
+            path = torch.cat([found.path, rest], dim=2)
+        return Solution(
+            poses=_reduced(poses),
+            energies=found.energies,
+            valid=valid,
+            chosen=chosen,
+            cost=Cost(network_passes=energy.passes, seconds=time.perf_counter() - began),
+            trajectory=path,
+        )
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
+        """See `Solver.solve_views`: candidates for each pair with the first image, selected and refined together.
+
+        The energies are those of the chosen candidates before refinement.
+        """
+        check_view_starts(view_sets, starts)
+        began = time.perf_counter()
+        sets, views = view_sets.views.shape
+        others = list(range(1, views))
+        energy = PairEnergy(self.prior, view_sets.pairs([0] * len(others), others), seed)
+        found = self._explore(energy, starts.flatten(0, 1))
+        poses, alone = (each.unflatten(0, (sets, views - 1)) for each in found[:2])  # [S, V - 1, K, 3], [S, V - 1, K]
+        duos = list(itertools.combinations(range(views - 1), 2))
+        between = self._between(energy, view_sets, poses, duos)
+        chosen = triangular_choice(alone, between, duos)
+        start = torch.take_along_dim(poses, chosen[..., None, None], dim=2).squeeze(2)
+        refined = self._refine(energy, view_sets.views, view_sets.ids, start)
+        energies = alone.new_full((sets, views, views), torch.nan)
+        energies[:, 0, 1:] = alone.gather(2, chosen[..., None]).squeeze(-1)
+        row = torch.arange(sets, device=chosen.device)
+        for number, (i, j) in enumerate(duos):
+            energies[:, i + 1, j + 1] = between[row, number, chosen[:, i], chosen[:, j]]
+        energies = torch.where(energies.isnan(), energies.mT, energies)  # both directions are in each
+        return ViewSolution(
+            poses=_reduced(refined.poses),
+            energies=energies,
+            valid=refined.valid & energies[:, 0, 1:].isfinite().all(dim=1),
+            cost=Cost(network_passes=energy.passes, seconds=time.perf_counter() - began),
+        )
+
+    # ------------------------------------------------------------ exploration
+
+    def _explore(self, energy: PairEnergy, starts: Tensor) -> Candidates:
+        """The best candidates of every pair: probed, the better half led a little downhill, probed again."""
+        poses = self._grid(starts) if self.candidates == "grid" else starts.clone()
+        noise = energy.noise(self.exploration_steps, len(self.probe_timesteps))
+        first = energy.mean(poses, self.probe_timesteps, noise)
+        poses = _take(poses, _order(first)[:, : max(1, poses.shape[1] // 2)])
+
+        def one_direction(poses: Tensor, step: int) -> Tensor:
+            ends = (energy.pairs.query, energy.pairs.reference)
+            forward = step % 2 == 0
+            target, source = ends if forward else ends[::-1]
+            return self._one_way(
+                energy, target, source, poses if forward else -poses, energy.noise(step)[:, 0, step % 2]
+            )
+
+        steps = self.exploration_steps
+        path, _, valid = descend(one_direction, _same, poses, steps, GradientDescent(poses, self.exploration_rate))
+        path = path[:, :, : max(1, steps)]  # as published, the last of the poses before an update is what counts
+        last = energy.mean(path[:, :, -1], self.probe_timesteps, noise).masked_fill(~valid, torch.nan)
+        best = _order(last)[:, : self.kept]
+        path = _take(path, best)
+        return Candidates(path[:, :, -1], last.gather(1, best), path)
+
+    def _grid(self, starts: Tensor) -> Tensor:
+        """Candidates `[B, longitudes x latitudes, 3]` at relative radius 0."""
+        longitudes = [2 * math.pi * number / self.longitudes for number in range(self.longitudes)]
+        poses = [(latitude, longitude, 0.0) for longitude in longitudes for latitude in self.latitudes]
+        return starts.new_tensor(poses).repeat(len(starts), 1, 1)
+
+    def _between(
+        self, energy: PairEnergy, view_sets: ViewSets, poses: Tensor, duos: Sequence[tuple[int, int]]
+    ) -> Tensor:
+        """Probed energies `[S, P, K, K]` of the relative poses that candidates `[S, V - 1, K, 3]` of P duos imply.
+
+        A duo is two of the other images, numbered from 0.
+        """
+        sets, _, count, _ = poses.shape
+        if not duos:
+            return poses.new_empty(sets, 0, count, count)
+        i, j = ([duo[end] for duo in duos] for end in (0, 1))
+        pairs = view_sets.pairs([each + 1 for each in i], [each + 1 for each in j])
+        probe = PairEnergy(self.prior, pairs, energy.seed, energy.codes)
+        implied = poses[:, j][:, :, None] - poses[:, i][:, :, :, None]  # [S, P, K of i, K of j, 3]
+        noise = probe.noise(self.exploration_steps, len(self.probe_timesteps))
+        energies = probe.mean(implied.flatten(2, 3).flatten(0, 1), self.probe_timesteps, noise)
+        energy.passes += probe.passes
+        return energies.view(sets, len(duos), count, count)
+
+    # ------------------------------------------------------------ refinement
+
+    def _refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, start: Tensor) -> Refined:
+        """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step."""
+        others = start.shape[1]
+        duos = list(itertools.combinations(range(others + 1), 2))
+        cycle = [pair for duo in duos for pair in (duo, duo[::-1])]  # (source, target)
+        moved = self._moved(cycle, ids, energy.seed, others)  # [steps, S, V]
+
+        def one_pair(flat: Tensor, step: int) -> Tensor:
+            source, target = cycle[step % len(cycle)]
+            poses = torch.nn.functional.pad(flat.unflatten(2, (others, 3)), (0, 0, 1, 0))[
+                :, 0
+            ]  # [S, V, 3], 0 the first
+            poses = torch.where(moved[step][..., None], poses, poses.detach())
+            noise = keyed_noise(self.prior, energy.seed, _REFINEMENT, ids, step)
+            relative = (poses[:, target] - poses[:, source])[:, None]
+            return self._one_way(energy, views[:, target], views[:, source], relative, noise)
+
+        steps, flat = len(moved), start.flatten(1)[:, None]
+        path, _, valid = descend(one_pair, _same, flat, steps, GradientDescent(flat, self.refinement_rate))
+        path = path[:, 0].unflatten(2, (others, 3))  # [S, steps + 1, V - 1, 3]
+        before = moved[..., 1:].transpose(0, 1)  # [S, steps, V - 1]
+        late = before & (before.flip(1).cumsum(1).flip(1) <= self.averaged)
+        count = late.sum(dim=1)[..., None]
+        mean = path[:, :-1].masked_fill(~late[..., None], 0.0).sum(dim=1) / count
+        return Refined(torch.where(count > 0, mean, start), valid[:, 0], path)
+
+    def _moved(self, cycle: Sequence[tuple[int, int]], ids: Tensor, seed: int, others: int) -> Tensor:
+        """Which image a step moves, `[steps, S, V]`: of its pair the one that is not the first, of two others a random
+        one."""
+        number = torch.arange(others * self.refinement_steps, device=ids.device)[:, None]
+        source, target = torch.tensor(cycle, device=ids.device)[number % len(cycle)].unbind(-1)  # [steps, 1]
+        coin = keyed_uniform(seed, _REFINEMENT, ids, number, count=1)[..., 0] < 0.5
+        of_two = torch.where(coin, source, target)
+        moved = torch.where(torch.minimum(source, target) > 0, of_two, torch.maximum(source, target))
+        return torch.nn.functional.one_hot(moved, others + 1).bool()
+
+    def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
+        """Denoising errors `[B, N]` of images `target` from `source` (`[B]` each) under poses `[B, N, 3]`.
+
+        All N meet the same noise `[B, *latent_shape]`.
+        """
+        count = poses.shape[1]
+        energy.passes += poses.shape[0] * count
+        errors = self.prior.denoising_error(
+            energy.codes[target.repeat_interleave(count)],
+            energy.codes[source.repeat_interleave(count)],
+            poses.flatten(0, 1),
+            torch.full((len(target) * count,), self.timestep, device=poses.device),
+            noise.repeat_interleave(count, dim=0),
+        )
+        return errors.view(-1, count)
+
+
+def triangular_choice(alone: Tensor, between: Tensor, duos: Sequence[tuple[int, int]]) -> Tensor:
+    """ID-Pose's selection among candidates for all other images of a set together: index `[S, V - 1]` of K each.
+
+    `alone` `[S, V - 1, K]` are the candidates' energies with the first image, `between` `[S, P, K, K]` those of the
+    relative poses which the candidates of the P `duos` imply for their two images. A candidate collects from every
+    duo of its image the least sum of both own energies and the one between, but at most three times its own: another
+    image without a good candidate shall not count against it. With no duos its own energy decides.
+    """
+    alone, between = (each.nan_to_num(nan=torch.inf) for each in (alone, between))
+    if not duos:
+        return alone.argmin(dim=-1)
+    total = torch.zeros_like(alone)
+    for number, (i, j) in enumerate(duos):
+        joint = alone[:, i, :, None] + alone[:, j, None, :] + between[:, number]
+        total[:, i] += torch.minimum(joint.amin(dim=2), 3 * alone[:, i])
+        total[:, j] += torch.minimum(joint.amin(dim=1), 3 * alone[:, j])
+    return total.argmin(dim=-1)
+
+
+def _same(poses: Tensor) -> Tensor:
+    return poses
+
+
+def _order(energies: Tensor) -> Tensor:
+    """Indices `[B, N]` from the least energy `[B, N]` to the largest; what is not finite comes last."""
+    return energies.nan_to_num(nan=torch.inf).argsort(dim=1, stable=True)
+
+
+def _take(values: Tensor, index: Tensor) -> Tensor:
+    """Of `[B, N, ...]` those at `[B, K]`."""
+    return values[torch.arange(len(values), device=values.device)[:, None], index]
+
+
+def _reduced(poses: Tensor) -> Tensor:
+    """The same poses `[..., 3]` with longitudes in [0, 2 pi)."""
+    latitude, longitude, radius = poses.unbind(-1)
+    return torch.stack([latitude, wrap_angle(longitude) % (2 * math.pi), radius], dim=-1)

@@ -1,0 +1,97 @@
+"""The paper's method: a learned score leads every start to the right valley, the prior's energy to its bottom."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lp_framework.errors import UserError
+from lp_framework.models.pose_model import PoseModel
+from lp_framework.priors.base import Prior
+from lp_framework.registry import register
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose
+from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.twist import ChooseBy, TanhRadius, TwistDescent
+
+
+@register("solver", "two_stage")
+class TwoStage(Solver):
+    """The paper's method: `langevin` on a score or energy model, then iFusion's descent of the prior from its ends.
+
+    Defaults are the paper's (appendix, Two Stage Optimization). First stage: `alpha`, `gamma`, `iterations`, see
+    `langevin`. Second stage: `refinement_steps` with `learning_rate`, `factor`, `patience` and timesteps that fall
+    linearly from `first_timestep` to `last_timestep`, see `ifusion`; it hands radii over by `TanhRadius`, since the
+    first stage may end at any. Without refinement steps it is the first stage alone.
+
+    The answer is the start of least second-stage energy, `choose_by` as for `ifusion`.
+    """
+
+    def __init__(
+        self,
+        model: PoseModel,
+        prior: Prior,
+        alpha: float = 0.1,
+        gamma: float | Sequence[float] = (0.0, 0.3, 0.0),
+        iterations: int = 50,
+        refinement_steps: int = 50,
+        learning_rate: float = 0.1,
+        factor: float = 0.7,
+        patience: int = 10,
+        first_timestep: int = 99,
+        last_timestep: int = 0,
+        choose_by: ChooseBy = "accumulated",
+        rescoring: int = 16,
+        trajectory: bool = False,
+    ) -> None:
+        if refinement_steps < 0:
+            raise UserError(f"solver.refinement_steps must not be negative, got {refinement_steps}")
+        self.model, self.prior = model, prior
+        self.first = Langevin(model, alpha, gamma, iterations, trajectory=trajectory)
+        self.second = TwistDescent(
+            prior,
+            TanhRadius(),
+            refinement_steps,
+            learning_rate,
+            factor,
+            patience,
+            first_timestep,
+            last_timestep,
+            choose_by,
+            rescoring,
+            fresh_noise=True,
+            trajectory=trajectory,
+        )
+
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        """See `Solver.solve`. A start is invalid when the model or the prior failed on its way."""
+        first = self.first.solve(pairs, starts, seed)
+        if self.second.steps == 0:
+            return first
+        # A start that failed goes along at the origin, so that the others stay in their places.
+        handed = first.poses.masked_fill(~first.valid[..., None], 0.0)
+        second = self.second.solve(pairs, handed, seed)
+        energies = second.energies.masked_fill(~first.valid, torch.nan)
+        return Solution(
+            poses=torch.where(first.valid[..., None], second.poses, first.poses),
+            energies=energies,
+            valid=first.valid & second.valid,
+            chosen=choose(energies),
+            cost=Cost(
+                network_passes=first.cost.network_passes + second.cost.network_passes,
+                seconds=first.cost.seconds + second.cost.seconds,
+            ),
+            trajectory=self._joined(first, second),
+        )
+
+    @staticmethod
+    def _joined(first: Solution, second: Solution) -> Tensor | None:
+        """Both stages' paths, the second's longitudes in the turn where the first ended; the hand-over counts once."""
+        if first.trajectory is None or second.trajectory is None:
+            return None
+        before, after = first.trajectory, second.trajectory[:, :, 1:]
+        turns = ((before[:, :, -1:, 1] - second.trajectory[:, :, :1, 1]) / (2 * math.pi)).round()
+        after = torch.stack([after[..., 0], after[..., 1] + 2 * math.pi * turns, after[..., 2]], dim=-1)
+        return torch.cat([before, after], dim=2)  # where the first stage failed the turns are NaN
