@@ -103,6 +103,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
         sweep = job.mode == RunMode.MULTIRUN
         # What starts this very job again, and it alone: Lightning runs it for its other processes.
         own = [override for override in job.overrides.hydra if not override.startswith("hydra.mode=")]
+        own += ["hydra.mode=RUN"] if sweep else []  # an experiment may ask for a sweep
         sys.argv = [sys.argv[0], command, *options, *own, *job.overrides.task]
         registry.discover(config.get("plugins", []))
         environment = dict(os.environ)

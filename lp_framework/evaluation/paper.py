@@ -1,0 +1,79 @@
+"""The paper's own numbers, as data: `paper/*.yaml`, a file a table.
+
+A file holds the table's `title`, the `experiment` of this project that repeats it, its `source` and `caption`, `notes`
+on what differs, the dotted `settings` in which its rows differ, the `columns` of its values (named as in
+`results.json`), and `rows`: a `label`, the `settings` that the run to compare with has, and the `values`, null where
+the paper has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+PAPER = "Landscape-Awareness for Geometric View Diffusion Model"
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A row of a table: its label in the paper, the settings of the run to compare with, and what the paper has."""
+
+    label: str
+    settings: Mapping[str, Any]
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table of the paper; `settings` are the keys in which its rows differ."""
+
+    name: str
+    title: str
+    experiment: str
+    source: str
+    caption: str
+    notes: Sequence[str]
+    settings: Sequence[str]
+    columns: Sequence[str]
+    rows: Sequence[PaperRow]
+
+    def matching(self, settings: Mapping[str, Any]) -> list[PaperRow]:
+        """The rows to put beside a run with these settings: all that they name is set so in the run."""
+        return [
+            row for row in self.rows if all(settings.get(key, _NOWHERE) == value for key, value in row.settings.items())
+        ]
+
+
+_NOWHERE = object()
+
+
+def paper_table(experiment: str | None) -> PaperTable | None:
+    """The table that an experiment repeats, if the paper has one."""
+    return next((table for table in paper_tables() if table.experiment == experiment), None)
+
+
+@cache
+def paper_tables() -> tuple[PaperTable, ...]:
+    """All tables that are here, by name."""
+    files = sorted((Path(__file__).parent / "paper").glob("*.yaml"))
+    return tuple(_read(file.stem, yaml.safe_load(file.read_text(encoding="utf-8"))) for file in files)
+
+
+def _read(name: str, content: Mapping[str, Any]) -> PaperTable:
+    columns = content["columns"]
+    rows = [
+        PaperRow(
+            row["label"],
+            row["settings"],
+            {key: value for key, value in zip(columns, row["values"], strict=True) if value is not None},
+        )
+        for row in content["rows"]
+    ]
+    texts = {key: " ".join(content[key].split()) for key in ("title", "experiment", "source", "caption")}
+    notes = [" ".join(note.split()) for note in content["notes"]]
+    return PaperTable(name=name, **texts, notes=notes, settings=content["settings"], columns=columns, rows=rows)

@@ -1,0 +1,257 @@
+"""Tables of sweeps in print: their layout, in the terminal, as Markdown, CSV and JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
+from lp_framework.evaluation.paper import PaperRow
+from lp_framework.evaluation.runs import COSTS
+from lp_framework.evaluation.sweep_tables import Row, Spread, SweepTable
+from lp_framework.evaluation.tables import COLUMNS, ERRORS
+
+METRICS = [*COLUMNS, *ERRORS, *COSTS]
+HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passes"], strict=True))
+PRINTED = [f"{prefix}{degrees}" for degrees in ROTATION_THRESHOLDS for prefix in ("R@", "R(R)@")]
+PRINTED += [f"S{name}" for name in PRINTED] + [*ERRORS, *COSTS]  # in the paper's order
+ACROSS = {  # a number whose values become columns, and the metrics that are rows then, as in the paper's tables
+    "views": ("R@15", "R@30", "R(R)@15", "R(R)@30"),
+    "start.count": ("R@30", "R(R)@30", "SR(R)@30", "seconds_per_pair"),
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a printed table: text cells, with the spread in `spreads` (empty where there is none)."""
+
+    cells: Sequence[str]
+    spreads: Sequence[str]
+    paper: bool
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A printed table: `labels` of its headings say what was set, the others are numbers."""
+
+    headings: Sequence[str]
+    labels: int
+    lines: Sequence[Line]
+
+
+def axis_across(table: SweepTable) -> str | None:
+    """The setting of `ACROSS` whose values are the columns of the printed table: the first that varies."""
+    return next((key for key in ACROSS if len({str(row.settings.get(key)) for row in table.rows}) > 1), None)
+
+
+def layout(table: SweepTable) -> Layout:
+    """The table as the paper would print it; the paper's own rows follow those that they are to be compared with."""
+    axis = axis_across(table)
+    return _down(table) if axis is None else _across(table, axis)
+
+
+def heading(key: str) -> str:
+    """A setting as a heading, as it is written on the command line.
+
+    >>> heading("solver.name"), heading("solver.gamma")
+    ('solver', 'solver.gamma')
+    """
+    return key.removesuffix(".name")
+
+
+def shown(value: Any) -> str:
+    """A setting's value in a table."""
+    if value is None:
+        return "-"
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def number(name: str, value: float) -> str:
+    """A metric's value, rounded as is usual for it."""
+    if not math.isfinite(value):
+        return "inf"
+    if name == "network_passes_per_pair":
+        return f"{value:.0f}"
+    if name == "rotation_error":
+        return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+    if name == "seconds_per_pair":
+        return f"{value:.3g}"
+    return f"{value:.3f}"
+
+
+def terminal(table: SweepTable) -> Table:
+    """The layout for a terminal: spreads below the means, the paper's rows dim."""
+    content = layout(table)
+    printed = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for place, name in enumerate(content.headings):
+        if place < content.labels:
+            printed.add_column(name, overflow="fold")
+        else:
+            printed.add_column(_broken(name), justify="right", no_wrap=True, min_width=_width(content, place))
+    for line in content.lines:
+        style = "dim" if line.paper else ""
+        below = [f"\n±{_short(spread)}" if spread else "" for spread in line.spreads]
+        cells = [_short(cell) if place >= content.labels else cell for place, cell in enumerate(line.cells)]
+        printed.add_row(*(Text.assemble((cell, style), (more, "dim")) for cell, more in zip(cells, below, strict=True)))
+    return printed
+
+
+def markdown(table: SweepTable) -> list[str]:
+    """The layout as lines of Markdown: means ± spreads, the paper's rows in italics."""
+    content = layout(table)
+    lines = [_markdown_row(content.headings), _markdown_row(["---"] * content.labels + ["---:"] * (
+        len(content.headings) - content.labels))]  # fmt: skip
+    for line in content.lines:
+        cells = [
+            f"{cell} ± {spread}" if spread else cell for cell, spread in zip(line.cells, line.spreads, strict=True)
+        ]
+        lines.append(_markdown_row([f"*{cell}*" if line.paper and cell else cell for cell in cells]))
+    return lines
+
+
+def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]]]:
+    """Columns and rows of all tables in one: a row a combination of settings, and the paper's rows."""
+    keys = list(dict.fromkeys(key for table in tables for key in table.columns))
+    columns = ["experiment", "source", *keys, "runs", "pairs"]
+    columns += [f"{name}{part}" for name in METRICS for part in ("", "_std")]
+    rows: list[list[object]] = []
+    for table in tables:
+        for row in table.rows:
+            rows.append([table.experiment, "runs", *(row.settings.get(key) for key in keys), len(row.seeds), row.pairs,
+                         *(part for name in METRICS for part in _rounded(row.metrics[name]))])  # fmt: skip
+        for line in table.paper.rows if table.paper else []:
+            label = f"paper: {line.label}"
+            rows.append([table.experiment, label, *(line.settings.get(key) for key in keys), None, None,
+                         *(part for name in METRICS for part in (line.metrics.get(name), None))])  # fmt: skip
+    return columns, rows
+
+
+def as_json(table: SweepTable) -> dict[str, Any]:
+    """The table with everything that is known of it."""
+    paper = table.paper
+    return {
+        "experiment": table.experiment,
+        "columns": table.columns,
+        "common": table.common,
+        "rows": [
+            {
+                "settings": row.settings,
+                "seeds": row.seeds,
+                "runs": [str(folder) for folder in row.folders],
+                "pairs": row.pairs,
+                "metrics": {name: value._asdict() for name, value in row.metrics.items()},
+            }
+            for row in table.rows
+        ],
+        "paper": paper
+        and {
+            **{"title": paper.title, "source": paper.source, "caption": paper.caption, "notes": paper.notes},
+            "rows": [{"label": row.label, "settings": row.settings, "metrics": row.metrics} for row in paper.rows],
+        },
+    }
+
+
+def _down(table: SweepTable) -> Layout:
+    """A line a row, the metrics across."""
+    labels = [*map(heading, table.columns), "runs"]
+    lines = []
+    for row, paper in _beside(table):
+        if row is not None:
+            cells = [shown(row.settings.get(key)) for key in table.columns] + [str(len(row.seeds))]
+            lines.append(_ours(cells, PRINTED, [row.metrics[name] for name in PRINTED]))
+        for each in paper:
+            label = [f"paper: {each.label}"] + [""] * len(table.columns)
+            values = [number(name, each.metrics[name]) if name in each.metrics else "-" for name in PRINTED]
+            lines.append(Line(label + values, [""] * (len(label) + len(values)), True))
+    return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
+
+
+def _across(table: SweepTable, axis: str) -> Layout:
+    """A line a metric of those that differ in the setting `axis` alone, the values of which are across."""
+    others = [key for key in table.columns if key != axis]
+    values = list(dict.fromkeys(row.settings.get(axis) for row in table.rows))
+    labels = [*map(heading, others), "runs", "metric"]
+    lines = []
+    for settings in _without(table, axis):
+        rows = {row.settings.get(axis): row for row in table.rows if _same(row.settings, settings, others)}
+        paper = {
+            value: table.paper.matching({**settings, axis: value}) if table.paper is not None else []
+            for value in values
+        }
+        runs = sorted({len(row.seeds) for row in rows.values()})
+        for name in ACROSS[axis]:
+            cells = [shown(settings.get(key)) for key in others] + ["-".join(map(str, runs))]
+            cells += [HEADINGS.get(name, name)]
+            lines.append(_ours(cells, [name] * len(values), [
+                rows[value].metrics[name] if value in rows else None for value in values]))  # fmt: skip
+            theirs = [
+                next((row.metrics[name] for row in paper[value] if name in row.metrics), None) for value in values
+            ]
+            if any(value is not None for value in theirs):
+                cells = ["paper", *[""] * (len(labels) - 2), HEADINGS.get(name, name)]
+                cells += ["-" if value is None else number(name, value) for value in theirs]
+                lines.append(Line(cells, [""] * len(cells), True))
+    return Layout([*labels, *(f"{heading(axis)}={shown(value)}" for value in values)], len(labels), lines)
+
+
+def _beside(table: SweepTable) -> list[tuple[Row | None, list[PaperRow]]]:
+    """Every row with the paper's rows to compare it with; last, without a row of ours, the rest of the paper's."""
+    paper = table.paper
+    if paper is None:
+        return [(row, []) for row in table.rows]
+    pairs: list[tuple[Row | None, list[PaperRow]]] = [(row, paper.matching(row.settings)) for row in table.rows]
+    met = [each for _, rows in pairs for each in rows]
+    return [*pairs, (None, [each for each in paper.rows if each not in met])]
+
+
+def _without(table: SweepTable, axis: str) -> list[dict[str, Any]]:
+    """What is set in the rows apart from `axis`, each once."""
+    found: list[dict[str, Any]] = []
+    for row in table.rows:
+        settings = {key: value for key, value in row.settings.items() if key != axis}
+        if settings not in found:
+            found.append(settings)
+    return found
+
+
+def _same(settings: Mapping[str, Any], others: Mapping[str, Any], keys: Sequence[str]) -> bool:
+    return all(settings.get(key) == others.get(key) for key in keys)
+
+
+def _ours(labels: Sequence[str], names: Sequence[str], values: Sequence[Spread | None]) -> Line:
+    cells, spreads = list(labels), [""] * len(labels)
+    for name, value in zip(names, values, strict=True):
+        cells.append("-" if value is None else number(name, value.mean))
+        spreads.append("" if value is None or value.std is None else number(name, value.std))
+    return Line(cells, spreads, False)
+
+
+def _rounded(value: Spread) -> tuple[float | str, float | None]:
+    if not math.isfinite(value.mean):
+        return "inf", None
+    return round(value.mean, 5), None if value.std is None else round(value.std, 5)
+
+
+def _short(cell: str) -> str:
+    """Shares without the leading zero: the table is wide."""
+    return cell.removeprefix("0") if cell.startswith("0.") else cell
+
+
+def _width(content: Layout, place: int) -> int:
+    return max(len(_short(text)) + 1 for line in content.lines for text in (line.cells[place], line.spreads[place]))
+
+
+def _broken(name: str) -> str:
+    """A heading in two lines where it is a metric's: `R(R)@5` as `@5` above `R(R)`."""
+    prefix, at, degrees = name.partition("@")
+    return f"@{degrees}\n{prefix}" if at else name.replace(" ", "\n")
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

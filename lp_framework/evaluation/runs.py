@@ -1,0 +1,219 @@
+"""Finished evaluations on disk: finding their folders, and what was set in each."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from lp_framework.errors import UserError
+
+RESULT = "results.json"
+HYDRA = Path(".hydra") / "hydra.yaml"  # what Hydra keeps of a job: its command and its choices
+COSTS = ("seconds_per_pair", "network_passes_per_pair")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished evaluation: its folder, the experiment's name if it had one, and what was set.
+
+    `settings` are dotted keys of the config without seeds, and `checkpoint`: the model's. `metrics` are over all
+    objects, `metrics_unique` over those with a unique answer (None where no object is labelled so); both hold the cost,
+    `COSTS`, too. A median error that is not finite is infinite.
+    """
+
+    folder: Path
+    experiment: str | None
+    seed: int
+    settings: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    metrics_unique: Mapping[str, float] | None
+    pairs: int
+    checkpoint: str | None
+
+
+class LeftOut(NamedTuple):
+    """A run that is not counted, and why."""
+
+    folder: Path
+    reason: str
+
+
+def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
+    """All finished evaluations in and below `folders`, and those that are unfinished, damaged or repeat another.
+
+    Raises `UserError` for a folder that is not there.
+    """
+    found: list[Run] = []
+    left_out: list[LeftOut] = []
+    for folder in _run_folders(folders):
+        if not (folder / RESULT).is_file():
+            left_out.append(LeftOut(folder, f"unfinished: no {RESULT}"))
+            continue
+        try:
+            found.append(read_run(folder))
+        except UserError as error:
+            left_out.append(LeftOut(folder, str(error)))
+    runs: list[Run] = []
+    for run in found:
+        same = next((other for other in runs if _identity(other) == _identity(run)), None)
+        if same is None:
+            runs.append(run)
+        else:
+            left_out.append(LeftOut(run.folder, f"repeats {same.folder}: the same settings and seed"))
+    return runs, left_out
+
+
+def read_run(folder: Path) -> Run:
+    """The finished evaluation in `folder`; `UserError` where its `results.json` is damaged or no evaluation's."""
+    file = folder / RESULT
+    try:
+        result = json.loads(file.read_text(encoding="utf-8"))
+        config = result["config"]
+        costs = {name: float(result[name]) for name in COSTS}
+        unique = result["metrics_unique_answer"]
+        return Run(
+            folder,
+            _job(folder)["experiment"],
+            int(result["seed"]),
+            {**settings(config), "protocol": result["protocol"], **checkpoint_setting(result["checkpoint"])},
+            {**_metrics(result["metrics"]), **costs},
+            None if unique is None else {**_metrics(unique), **costs},
+            int(result["pairs"]),
+            result["checkpoint"],
+        )
+    except (OSError, ValueError) as error:  # of JSON, too
+        raise UserError(f"damaged: {file} cannot be read ({error})") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"damaged: {file} is not the result of an evaluation ({error!r})") from error
+
+
+def settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What was set, by dotted keys: without seeds, plugin folders and the checkpoint; whole numbers as int.
+
+    >>> settings({"seed": 1, "data": {"name": "toy", "seed": 1}, "solver": {"gamma": [0.0, 0.3, 0.0]}})
+    {'data.name': 'toy', 'solver.gamma': 0.3}
+    """
+    values = {key: _number(value) for key, value in dotted(config).items() if not _is_left_aside(key)}
+    return {key: _longitude_noise(value) if key.endswith(".gamma") else value for key, value in values.items()}
+
+
+def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config's values by their dotted keys; a list is one value.
+
+    >>> dotted({"seed": 1, "start": {"name": "ring", "count": 4}})
+    {'seed': 1, 'start.name': 'ring', 'start.count': 4}
+    """
+    found: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            found |= {f"{key}.{name}": each for name, each in dotted(value).items()}
+        else:
+            found[str(key)] = value
+    return found
+
+
+def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
+    """`{"checkpoint": ...}`, nothing for a solver without a model.
+
+    The value tells apart models that were trained differently, but not those that differ in their training's seed: the
+    training run's settings and which of its files it is, as JSON, where its folder is there, else the path.
+    """
+    if checkpoint is None:
+        return {}
+    path = Path(checkpoint)
+    configs = [folder / "config.yaml" for folder in (path.parent, path.parent.parent)]
+    file = next((each for each in configs if each.is_file()), None)
+    if file is None:
+        return {"checkpoint": checkpoint}
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
+        return {"checkpoint": json.dumps({**settings(config), "file": path.name}, sort_keys=True)}
+    except (OSError, YAMLError, OmegaConfBaseException, AttributeError):
+        return {"checkpoint": checkpoint}
+
+
+def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
+    """A short name for every value of the setting `checkpoint`: the model's name where that tells them apart, else the
+    training run's folder, else the path.
+    """
+    paths = {run.settings["checkpoint"]: Path(run.checkpoint) for run in runs if run.checkpoint is not None}
+    candidates: list[dict[str, str]] = [
+        {value: _model_name(value) or str(path) for value, path in paths.items()},
+        {value: str(path.parent.parent) for value, path in paths.items()},
+        {value: str(path) for value, path in paths.items()},
+    ]
+    return next((names for names in candidates if len(set(names.values())) == len(names)), candidates[-1])
+
+
+def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The keys whose values differ, with both values; a key that is missing on a side counts as None there.
+
+    >>> differences({"gamma": 0, "steps": 5}, {"gamma": 0.3, "steps": 5})
+    {'gamma': (0, 0.3)}
+    """
+    keys = sorted({*ours, *theirs})
+    return {key: (ours.get(key), theirs.get(key)) for key in keys if ours.get(key) != theirs.get(key)}
+
+
+def _run_folders(folders: Sequence[Path]) -> Iterable[Path]:
+    """Folders in and below `folders` with a result, or made by an `eval`; each once, in natural order."""
+    found: dict[Path, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise UserError(f"runs={folder}: there is no such folder")
+        below = [file.parent for file in folder.rglob(RESULT)]
+        below += [file.parent.parent for file in folder.rglob(str(HYDRA)) if _job(file.parent.parent)["name"] == "eval"]
+        found |= {each.resolve(): each for each in below}
+    return sorted(found.values(), key=lambda path: [(len(part), part) for part in path.parts])
+
+
+def _job(folder: Path) -> dict[str, Any]:
+    """The command (`name`) and the `experiment` of the job in `folder`, None where they are not known."""
+    try:
+        hydra = yaml.load((folder / HYDRA).read_text(encoding="utf-8"), yaml.CSafeLoader)["hydra"]
+        return {"name": hydra["job"]["name"], "experiment": hydra["runtime"]["choices"].get("experiment")}
+    except (OSError, YAMLError, ValueError, KeyError, TypeError):
+        return {"name": None, "experiment": None}
+
+
+def _metrics(values: Mapping[str, float | None]) -> dict[str, float]:
+    return {name: math.inf if value is None else float(value) for name, value in values.items()}
+
+
+def _is_left_aside(key: str) -> bool:
+    """Whether a key is not compared: seeds, plugin folders, and the checkpoint, which has `checkpoint_setting`."""
+    return key in ("plugins", "checkpoint", "seed") or key.endswith(".seed")
+
+
+def _number(value: Any) -> Any:
+    """A value with whole numbers as int, so that 0.0 is 0."""
+    if isinstance(value, list):
+        return [_number(each) for each in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _longitude_noise(gamma: Any) -> Any:
+    """`[0, g, 0]` as g: both say the same noise."""
+    if isinstance(gamma, list) and len(gamma) == 3 and gamma[0] == gamma[2] == 0:
+        return gamma[1]
+    return gamma
+
+
+def _model_name(checkpoint: str) -> str | None:
+    try:
+        return str(json.loads(checkpoint)["model.name"])
+    except (ValueError, KeyError, TypeError):  # a path
+        return None
+
+
+def _identity(run: Run) -> tuple[Any, ...]:
+    return run.settings, run.seed, run.checkpoint, run.experiment

@@ -1,0 +1,157 @@
+"""Finished runs as tables: what varies between them, and mean and spread over their seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from lp_framework.evaluation.paper import PaperTable, paper_table
+from lp_framework.evaluation.runs import LeftOut, Run, checkpoint_names
+
+Objects = Literal["unique_answer", "all"]
+
+
+class Spread(NamedTuple):
+    """Mean over seeds and sample standard deviation (n - 1), None for a single seed or where it is not finite."""
+
+    mean: float
+    std: float | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """The runs that differ in nothing but their seeds: what was set, of the table's columns, and the metrics."""
+
+    settings: Mapping[str, Any]
+    metrics: Mapping[str, Spread]
+    seeds: Sequence[int]
+    folders: Sequence[Path]
+    pairs: int
+
+
+@dataclass(frozen=True)
+class SweepTable:
+    """The runs of one experiment (or those without one): a row for every combination of settings.
+
+    `columns` are the settings that vary and those that the paper's table varies; `common` holds those that all runs
+    share, and `paper` the paper's own table of this experiment, if it has one.
+    """
+
+    experiment: str | None
+    columns: Sequence[str]
+    rows: Sequence[Row]
+    common: Mapping[str, Any]
+    paper: PaperTable | None
+
+
+def sweep_tables(runs: Sequence[Run], objects: Objects) -> tuple[list[SweepTable], list[LeftOut]]:
+    """A table an experiment, by name, those without one last; and the runs that have nothing to say of `objects`."""
+    left_out = []
+    if objects == "unique_answer":
+        reason = "no object is labelled as having a unique answer; objects=all counts every object"
+        left_out = [LeftOut(run.folder, reason) for run in runs if run.metrics_unique is None]
+        runs = [run for run in runs if run.metrics_unique is not None]
+    names = sorted({run.experiment for run in runs}, key=lambda name: (name is None, name or ""))
+    tables = [_table([run for run in runs if run.experiment == name], name, objects) for name in names]
+    return tables, left_out
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Mean and sample standard deviation.
+
+    >>> spread([1.0, 2.0, 3.0])
+    Spread(mean=2.0, std=1.0)
+    """
+    mean = math.fsum(values) / len(values)
+    return Spread(mean, statistics.stdev(values) if len(values) > 1 and math.isfinite(mean) else None)
+
+
+def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The fewest keys that tell the given settings apart, in their order.
+
+    A key that only some have (a solver's own setting) counts only if it varies among those; and a setting that the
+    choice of its group says (`solver.steps`, where every `solver.name` has its own) is left out. Either comes back
+    where two different settings would look the same without it.
+
+    >>> varying([{"solver.name": "a", "solver.steps": 1}, {"solver.name": "b", "solver.steps": 2, "solver.tries": 1}])
+    ['solver.name']
+    """
+    keys = list(dict.fromkeys(key for each in settings for key in each))
+    varied = [key for key in keys if len(_values(settings, key)) > 1]
+    chosen = [key for key in varied if not _said_by_choice(settings, key)]
+    for key in keys:
+        if len(_distinct(settings, chosen)) == len(_distinct(settings, keys)):
+            break
+        if key not in chosen and len(_distinct(settings, [*chosen, key])) > len(_distinct(settings, chosen)):
+            chosen.append(key)
+    # Names come first, so that a number's values stand together.
+    return sorted(chosen, key=lambda key: (not key.endswith(".name"), keys.index(key)))
+
+
+def in_order(value: Any) -> tuple[int, float, str]:
+    """A sort key for settings: nothing, false, true, numbers by size, everything else as text.
+
+    >>> sorted([10, "b", None, 9, "a"], key=in_order)
+    [None, 9, 10, 'a', 'b']
+    """
+    if isinstance(value, bool | int | float):
+        return (1, float(value), "")
+    return (0, 0.0, "") if value is None else (2, 0.0, str(value))
+
+
+def _table(runs: Sequence[Run], experiment: str | None, objects: Objects) -> SweepTable:
+    names = checkpoint_names(runs)
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(json.dumps(run.settings, sort_keys=True), []).append(run)
+    shown = [_with_names(group[0].settings, names) for group in groups.values()]
+    paper = paper_table(experiment)
+    columns = varying(shown)
+    columns += [key for key in (paper.settings if paper else []) if key not in columns and _values(shown, key)]
+    rows = []
+    for settings, group in zip(shown, groups.values(), strict=True):
+        group = sorted(group, key=lambda run: (run.seed, str(run.folder)))
+        chosen: list[Mapping[str, float]] = [
+            run.metrics_unique if objects == "unique_answer" and run.metrics_unique is not None else run.metrics
+            for run in group
+        ]
+        rows.append(
+            Row(
+                {key: settings[key] for key in columns if key in settings},
+                {name: spread([each[name] for each in chosen]) for name in chosen[0]},
+                [run.seed for run in group],
+                [run.folder for run in group],
+                group[0].pairs,
+            )
+        )
+    rows.sort(key=lambda row: [in_order(row.settings.get(key)) for key in columns])
+    common = {key: value for key, value in shown[0].items() if all(each.get(key) == value for each in shown)}
+    return SweepTable(experiment, columns, rows, common, paper)
+
+
+def _with_names(settings: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    if "checkpoint" not in settings:
+        return dict(settings)
+    return {**settings, "checkpoint": names[settings["checkpoint"]]}
+
+
+def _values(settings: Sequence[Mapping[str, Any]], key: str) -> set[str]:
+    """The values of a key, as text, of those that have it."""
+    return {json.dumps(each[key]) for each in settings if key in each}
+
+
+def _said_by_choice(settings: Sequence[Mapping[str, Any]], key: str) -> bool:
+    choice = f"{key.rpartition('.')[0]}.name"
+    names = {each.get(choice) for each in settings if key in each}
+    if key == choice or len(names) == 1:
+        return False
+    return all(len(_values([each for each in settings if each.get(choice) == name], key)) == 1 for name in names)
+
+
+def _distinct(settings: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> set[str]:
+    return {json.dumps({key: each[key] for key in keys if key in each}) for each in settings}

@@ -1,0 +1,126 @@
+"""The paper's numbers as data: those of its LaTeX source, and rows that runs are compared with."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from lp_framework.evaluation.paper import paper_table, paper_tables
+from lp_framework.evaluation.report_tables import METRICS
+
+SOURCE = Path(__file__).parents[1].parent / "shared" / "paper" / "landscape_awareness.tex"
+LABELS = {
+    "gamma": "tab:noise_scale",
+    "methods": "tab:eval_results_myGSO_myOO3D",
+    "priors": "tab:ablation_model",
+    "score_energy": "tab:2methods_performance",
+    "stages": "tab:multi_view",
+    "starts": "tab:inference_time",
+}
+
+
+@pytest.fixture(scope="module")
+def source() -> str:
+    if not SOURCE.is_file():
+        pytest.skip(f"the paper's LaTeX source is not at {SOURCE}")
+    return SOURCE.read_text(encoding="utf-8")
+
+
+def latex_table(source: str, label: str) -> str:
+    tables = re.findall(r"\\begin\{table\*?\}.*?\\end\{table\*?\}", source, re.DOTALL)
+    (table,) = (each for each in tables if f"\\label{{{label}}}" in each)
+    return table
+
+
+def latex_rows(table: str) -> list[list[float | None]]:
+    """The cells of every row that are a number with decimals, or a dash for none."""
+    rows = []
+    for line in table.split(r"\\"):
+        cells = [re.sub(r"\\text(bf|color\{\w+\})|[{}\s]", "", cell) for cell in line.split("&")]
+        values = [None if cell == "-" else float(cell) for cell in cells if re.fullmatch(r"-|\d+\.\d+", cell)]
+        if len(values) > 1:
+            rows.append(values)
+    return rows
+
+
+def in_plain_words(text: str) -> list[str]:
+    text = text.replace(r"$\gamma$", "gamma").replace(r"^\circ$", " degrees").replace(r"\&", "and")
+    return re.findall(r"\w+", re.sub(r"\\\w+(\{\w+\}\{)?|[{}$]", " ", text))
+
+
+def values(name: str) -> list[list[float | None]]:
+    table = paper_table(name)
+    assert table is not None
+    return [[row.metrics.get(column) for column in table.columns] for row in table.rows]
+
+
+def test_every_table_is_checked():
+    assert {table.name for table in paper_tables()} == set(LABELS)
+    assert all(table.name == table.experiment for table in paper_tables())
+
+
+@pytest.mark.parametrize("name", ["methods", "priors", "score_energy"])
+def test_a_table_with_a_row_a_line_is_the_papers(source, name):
+    assert values(name) == latex_rows(latex_table(source, LABELS[name]))
+
+
+def test_the_table_of_noise_scales_is_the_papers(source):
+    rows = latex_rows(latex_table(source, LABELS["gamma"]))
+    settings = [row.settings["solver.gamma"] for row in paper_table("gamma").rows]
+    # The scale itself is a cell that looks like a number, unless it is written without decimals.
+    assert [
+        [*([] if gamma == 0 else [gamma]), *row] for gamma, row in zip(settings, values("gamma"), strict=True)
+    ] == rows
+
+
+def test_the_table_of_inference_time_is_the_papers(source):
+    recall, time = latex_rows(latex_table(source, LABELS["starts"]))
+    assert values("starts") == [list(pair) for pair in zip(recall, time, strict=True)]
+    rows = paper_table("starts").rows
+    assert [row.settings["start.count"] for row in rows] == [2, 4, 6, 8] * 2
+    assert [row.settings["solver.name"] for row in rows] == ["ifusion"] * 4 + ["two_stage"] * 4
+
+
+def test_the_multi_view_table_is_the_papers(source):
+    rows = latex_rows(latex_table(source, LABELS["stages"]))
+    assert len(rows) == 6
+    within_15, within_30 = [*rows[0], *rows[1], *rows[2]], [*rows[3], *rows[4], *rows[5]]
+    assert values("stages") == [list(pair) for pair in zip(within_15, within_30, strict=True)]
+    stages = [tuple(row.settings.values()) for row in paper_table("stages").rows]
+    assert stages == [(first, second, views) for first, second in ((False, True), (True, False), (True, True))
+                      for views in range(2, 9)]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(LABELS))
+def test_a_caption_is_the_papers_without_its_remarks_on_print(source, name):
+    text = latex_table(source, LABELS[name]).partition(r"\caption{")[2].partition(r"\renewcommand")[0]
+    ours, theirs = in_plain_words(paper_table(name).caption), in_plain_words(text)
+    assert theirs[: len(ours)] == ours
+
+
+@pytest.mark.parametrize("table", paper_tables(), ids=lambda table: table.name)
+def test_a_table_names_what_runs_have(table):
+    assert set(table.columns) <= set(METRICS)
+    assert all(set(row.settings) == set(table.settings) for row in table.rows)
+    assert table.source and table.caption and table.notes
+    assert all(0 <= value <= 1 for row in table.rows for name, value in row.metrics.items() if "R" in name)
+
+
+def test_the_main_table_has_the_recalls_of_gamma_03_and_the_success_rates_of_no_gamma():
+    ours = next(row for row in paper_table("methods").rows if row.label == "GSO, Ours").metrics
+    scales = {row.settings["solver.gamma"]: row.metrics for row in paper_table("gamma").rows}
+    assert all(ours[f"R@{degrees}"] == scales[0.3][f"R@{degrees}"] for degrees in (5, 15, 30))
+    success = [f"SR@{degrees}" for degrees in (5, 15, 30)]
+    assert not any([ours[name] for name in success] == [row[name] for name in success] for row in scales.values())
+    nearest = min(scales, key=lambda gamma: sum(abs(ours[name] - scales[gamma][name]) for name in success))
+    assert nearest == 0.1
+
+
+def test_a_run_is_compared_with_the_rows_whose_settings_it_has():
+    table = paper_table("methods")
+    matching = table.matching({"solver.name": "ifusion", "data.name": "toy"})
+    assert [row.label for row in matching] == ["GSO, iFusion", "OO3D, iFusion"]
+    assert table.matching({"solver.name": "langevin"}) == [] == table.matching({})
+    assert paper_table("nothing") is None and paper_table(None) is None

@@ -1,0 +1,233 @@
+"""Sweeps: the experiments that make the paper's tables, continuing an interrupted sweep, launchers."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from tiny_runs import Commands, Ran
+
+from lp_framework.evaluation.paper import paper_tables
+
+ROOT = Path(__file__).parents[1]
+SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=score", "solver.iterations=2")
+
+
+# ---------------------------------------------------------------- experiments
+
+
+@pytest.fixture
+def jobs(monkeypatch):
+    """What `eval` was run with: config, folder, command line and mode of every job."""
+    import lp_framework.commands.eval as command
+
+    jobs = []
+
+    def run(config):
+        jobs.append((config, HydraConfig.get().runtime.output_dir, list(sys.argv)))
+
+    monkeypatch.setattr(command, "run", run)
+    return jobs
+
+
+@pytest.mark.parametrize(
+    ("experiment", "narrowed", "varies"),
+    [
+        ("gamma", (), {("two_stage", gamma) for gamma in (0, 0.1, 0.3, 0.5)}),
+        ("starts", ("start.count=2,8",), {(solver, count) for solver in ("ifusion", "two_stage") for count in (2, 8)}),
+        ("priors", (), {("two_stage", "tiny")}),
+        ("score_energy", (), {("two_stage", "runs/score"), ("two_stage", "runs/energy")}),
+        ("stages", ("views=2,8",), {(first, second, views) for first, second in ((True, True), (True, False),
+                                                                                 (False, True)) for views in (2, 8)}),
+        ("methods", (), {(solver, "grid") for solver in ("langevin", "ifusion", "id_pose", "two_stage")}),
+    ],
+)  # fmt: skip
+def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, narrowed, varies):
+    ran = lp("eval", f"experiment={experiment}", "seed=5", *narrowed)  # the command line wins over the experiment
+    assert ran.status == 0, ran.err
+    keys = {
+        "gamma": lambda c: (c.solver.name, c.solver.gamma),
+        "starts": lambda c: (c.solver.name, c.start.count),
+        "priors": lambda c: (c.solver.name, c.prior.name),
+        "score_energy": lambda c: (c.solver.name, c.checkpoint),
+        "stages": lambda c: (c.solver.first_stage, c.solver.second_stage, c.views),
+        "methods": lambda c: (c.solver.name, c.start.name),
+    }[experiment]
+    assert len(jobs) == len(varies) and {keys(config) for config, _, _ in jobs} == varies
+    assert {config.seed for config, _, _ in jobs} == {5} and {config.data.name for config, _, _ in jobs} == {"toy"}
+    folders = {folder for _, folder, _ in jobs}
+    assert len(folders) == len(varies)
+    assert all(tmp_path / "runs" / "multirun" / "eval" / experiment in Path(folder).parents for folder in folders)
+
+
+def test_every_table_of_the_paper_has_its_experiment_over_three_seeds():
+    for table in paper_tables():
+        file = ROOT / "conf" / "experiment" / f"{table.experiment}.yaml"
+        params = yaml.safe_load(file.read_text())["hydra"]["sweeper"]["params"]
+        assert params["seed"] == "0,1,2"
+
+
+def test_an_experiment_is_one_run_where_asked(lp, jobs, tmp_path):
+    assert lp("eval", "experiment=gamma", "hydra.mode=RUN", "hydra.run.dir=one").status == 0
+    ((config, folder, _),) = jobs
+    assert config.solver.name == "two_stage" and folder == str(tmp_path / "one")
+
+
+def test_what_a_job_starts_again_is_the_job_and_not_the_sweep(lp, jobs, monkeypatch):
+    assert lp("eval", "experiment=gamma", "seed=0").status == 0
+    again = jobs[2][2]
+    assert "hydra.mode=RUN" in again and "solver.gamma=0.3" in again
+    jobs.clear()
+    assert lp(*again[1:], "hydra.run.dir=again").status == 0
+    assert [config.solver.gamma for config, _, _ in jobs] == [0.3]
+
+
+# ---------------------------------------------------------------- continuing
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory) -> Commands:
+    """A working folder with a trained model in `score`."""
+    commands = Commands(tmp_path_factory.mktemp("sweeps"), train_views=3, test_views=2)
+    trained = commands.here("score", "train", "trainer.max_epochs=1", "data.validation_views=0")
+    assert trained.status == 0, trained.err
+    return commands
+
+
+@pytest.fixture
+def sweep(commands, monkeypatch):
+    """`sweep("seed=0,1")` in a folder that is new for every test; no pictures, which take most of a run's time."""
+    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+    number = sum(each.name.startswith("sweep") for each in commands.folder.iterdir())
+
+    def run(*overrides: str) -> Ran:
+        return commands.here("unused", "eval", *SWEEP, f"hydra.sweep.dir=sweep{number}", *overrides)
+
+    run.folder = commands.folder / f"sweep{number}"
+    return run
+
+
+def result(folder: Path) -> dict:
+    return json.loads((folder / "results.json").read_text())
+
+
+def test_a_sweep_goes_on_with_the_jobs_that_have_no_result(sweep):
+    assert sweep("seed=0,1,2").status == 0
+    whole = {number: result(sweep.folder / number) for number in "012"}
+    when = {number: (sweep.folder / number / "results.json").stat().st_mtime_ns for number in "02"}
+    (sweep.folder / "1" / "results.json").unlink()
+    (sweep.folder / "2" / "results.json").write_text("")  # what a power cut may leave
+    again = sweep("seed=0,1,2")
+    assert again.status == 0
+    skipped = [line for line in again.out.splitlines() if line.startswith("skipped, finished before: ")]
+    assert skipped == [f"skipped, finished before: {sweep.folder.name}/0"]
+    for number in "012":
+        assert result(sweep.folder / number)["metrics"] == whole[number]["metrics"]
+    assert (sweep.folder / "0" / "results.json").stat().st_mtime_ns == when["0"]
+
+
+def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(sweep):
+    assert sweep("solver.gamma=0,0.1").status == 0
+    before = (sweep.folder / "1" / "results.json").read_bytes()
+    again = sweep("solver.gamma=0,0.3,0.5")
+    assert again.status == 1
+    assert (
+        f"{sweep.folder.name}/1: holds the results of another configuration (solver.gamma is 0.1 there, 0.3 here); "
+        "give another hydra.sweep.dir, or remove it"
+    ) in again.err
+    assert (sweep.folder / "1" / "results.json").read_bytes() == before
+    assert result(sweep.folder / "2")["config"]["solver"]["gamma"] == 0.5
+
+
+def test_another_seed_or_another_model_is_another_configuration(sweep, commands):
+    assert sweep("seed=3").status == 0
+    assert "seed is 3 there, 4 here" in sweep("seed=4").err
+    os.makedirs(commands.folder / "copy", exist_ok=True)
+    copy = commands.folder / "copy" / "best.ckpt"
+    copy.write_bytes((commands.folder / "score" / "checkpoints" / "best.ckpt").read_bytes())
+    assert (
+        "checkpoint is score/checkpoints/best.ckpt there, copy/best.ckpt here" in sweep("seed=3", "checkpoint=copy").err
+    )
+
+
+def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
+    assert sweep("seed=0").status == 0
+    checkpoint = commands.folder / "score" / "checkpoints" / "best.ckpt"
+    kept = checkpoint.stat()
+    os.utime(checkpoint, (time.time() + 60, time.time() + 60))
+    try:
+        assert "holds the results of an earlier score/checkpoints/best.ckpt" in sweep("seed=0").err
+    finally:
+        os.utime(checkpoint, (kept.st_atime, kept.st_mtime))
+    assert "skipped" in sweep("seed=0").out
+
+
+def test_a_single_run_is_made_anew(commands, monkeypatch):
+    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+    for _ in range(2):
+        ran = commands.here("single", "eval", "checkpoint=score", "solver.iterations=2")
+        assert ran.status == 0 and "skipped" not in ran.out
+
+
+def test_an_experiment_goes_on_in_its_own_folder(commands, monkeypatch):
+    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+    first = ("experiment=gamma", "solver=langevin", "checkpoint=score", "seed=0", "solver.gamma=0,0.3")
+    assert commands.here("unused", "eval", *first).status == 0
+    more = commands.here("unused", "eval", *first[:-2], "seed=0,1", "solver.gamma=0,0.3")
+    assert more.status == 0 and more.out.count("skipped, finished before: ") == 2
+    below = commands.folder / "runs" / "multirun" / "eval" / "gamma"
+    assert len(list(below.rglob("results.json"))) == 4
+
+
+# ---------------------------------------------------------------- launchers
+
+
+@pytest.mark.parametrize(
+    ("package", "launcher", "gammas"),
+    [
+        ("hydra_plugins.hydra_joblib_launcher", ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"), (0, 0.3)),
+        ("hydra_plugins.hydra_submitit_launcher", ("hydra/launcher=submitit_local",), (0.3,)),
+    ],
+)
+def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice(
+    commands, monkeypatch, package, launcher, gammas
+):
+    pytest.importorskip(package, reason="the launchers are in the extra sweeps")
+    monkeypatch.setattr("lp_framework.viz.pictures.save_pictures", None)  # the plugin changes it here, too
+    quick = commands.folder / "plugins" / "tmp_tiny_quick"
+    quick.mkdir(exist_ok=True)
+    (quick / "tmp_tiny_quick.py").write_text(QUICK)
+    name = launcher[0].partition("=")[2]
+    sweep = ("experiment=gamma", f"hydra.sweep.dir={name}", "solver=tmp_tiny_quick", "checkpoint=score", "seed=0",
+             f"solver.gamma={','.join(map(str, gammas))}")  # fmt: skip
+    ran = commands.process("unused", "eval", *sweep, *launcher)
+    assert ran.status == 0, ran.err
+    folders = sorted(file.parent for file in (commands.folder / name).rglob("results.json"))
+    assert tuple(result(folder)["config"]["solver"]["gamma"] for folder in folders) == gammas
+    again = commands.here("unused", "eval", *sweep)  # in this process, but the same sweep
+    assert again.status == 0 and again.out.count("skipped, finished before: ") == len(gammas)
+
+
+# A solver of a plugin, and no pictures, which take most of a run's time.
+QUICK = '''
+import lp_framework.viz.pictures
+from lp_framework.models.pose_model import PoseModel
+from lp_framework.registry import register
+from lp_framework.solvers.langevin import Langevin
+
+lp_framework.viz.pictures.save_pictures = lambda *arguments: []
+
+
+@register("solver", "tmp_tiny_quick")
+class Quick(Langevin):
+    """Two steps of langevin."""
+
+    def __init__(self, model: PoseModel, gamma: float = 0.0) -> None:
+        super().__init__(model, gamma=gamma, iterations=2)
+'''
