@@ -73,6 +73,14 @@ def test_a_plugin_installed_as_a_package_is_chosen_on_the_command_line(installed
     assert re.search(r"^color_grid +package lp-color-grid 0\.1\.0 +grid=4, ", listing, re.MULTILINE)
 
 
+def test_the_wheel_has_the_weights_and_the_papers_numbers(installed, tmp_path):
+    code = (
+        "import lp_framework; from lp_framework.evaluation.paper import paper_tables; "
+        "print(lp_framework.load_prior('tiny').latent_shape, len(paper_tables()))"
+    )
+    assert run(installed / "python", "-c", code, cwd=tmp_path).stdout == "(192, 1, 1) 6\n"
+
+
 def test_every_dependency_is_pinned_once_for_a_python():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert all(re.fullmatch(r"[a-z0-9-]+==[\w.]+( ; python_version (>=|<) \"3\.11\")?", line) for line in lines)

@@ -15,7 +15,7 @@ import pytest
 import torch
 from tiny_runs import Commands, Ran
 
-from lp_framework.models.checkpoints import find_checkpoint, load_model, default_checkpoint, read_checkpoint
+from lp_framework.models.checkpoints import SHIPPED, default_checkpoint, find_checkpoint, load_model, read_checkpoint
 
 EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6", "backbone.pause=0.1")
 
@@ -265,6 +265,7 @@ def test_a_run_a_checkpoint_and_the_latest_run_are_found(score, commands, tmp_pa
     assert default_checkpoint(tmp_path) == tmp_path / "new" / "checkpoints" / "best.ckpt"
     (tmp_path / "new" / "checkpoints" / "best.ckpt").unlink()
     assert default_checkpoint(tmp_path).name == "last.ckpt"
+    assert default_checkpoint(tmp_path / "nothing") == SHIPPED / "score" / "model.safetensors"
 
 
 def test_reading_a_checkpoint_runs_no_code_of_it(score):

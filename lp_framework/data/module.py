@@ -20,6 +20,7 @@ from lp_framework.data.views import ObjectViews, object_names, read_views
 from lp_framework.errors import UserError
 
 EVALUATION_PAIRS = 224  # pairs a batch; four objects of eight test views
+LARGEST_SET = 8  # images that are evaluated together at most, as in the paper's multi-view table
 
 
 class FeatureExtractor(Protocol):
@@ -58,6 +59,7 @@ class PairDataModule(LightningDataModule):
         self.validation_views, self.seed = validation_views, seed
         self._extractor: FeatureExtractor | None = None
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
+        self._views: int | None = None  # images a set, where sets are evaluated
         self._folders: dict[str, list[ObjectViews]] = {}
         self._tables: dict[str, ViewTable] = {}
 
@@ -100,7 +102,16 @@ class PairDataModule(LightningDataModule):
 
     def evaluate_on(self, protocol: str, seed: int) -> None:
         """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
-        self._evaluation = protocol, seed
+        self._evaluation, self._views = (protocol, seed), None
+
+    def evaluate_on_sets(self, views: int) -> None:
+        """From now on prepare only the test views; `test_dataloader` gives `ViewTable.view_sets` of so many images.
+
+        A set comes as the pairs of its first view with each other one, `views` - 1 in a row, a batch holds whole sets.
+        """
+        if not isinstance(views, int) or not 2 <= views <= LARGEST_SET:
+            raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
+        self._evaluation, self._views = ("view_sets", 0), views
 
     def evaluation_split(self) -> str:
         """The split that the protocol of `evaluate_on` takes its pairs from."""
@@ -148,17 +159,21 @@ class PairDataModule(LightningDataModule):
         """All ordered pairs of the held-out training views, always in the same order."""
         if not self.validation_views:
             return []
-        return self._listed("validation", "ordered", self.batch_pairs)
+        data = self.data("validation")
+        return self._listed(data, data.table.pairs("ordered"), self.batch_pairs)
 
     def test_dataloader(self) -> DataLoader[PairBatch]:
-        """The pairs of the protocol that `evaluate_on` has set, by default all ordered pairs of the test views."""
+        """The pairs or sets to evaluate on that were chosen, by default all ordered pairs of the test views."""
+        data = self.data(self.evaluation_split())
+        if self._views is not None:
+            sets = data.table.view_sets(self._views)
+            pairs = np.stack([np.repeat(sets[:, :1], self._views - 1, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
+            return self._listed(data, pairs, EVALUATION_PAIRS // (self._views - 1) * (self._views - 1))
         protocol, seed = self._evaluation or ("ordered", 0)
-        return self._listed(self.evaluation_split(), protocol, EVALUATION_PAIRS, seed)
+        return self._listed(data, data.table.pairs(protocol, seed), EVALUATION_PAIRS)
 
-    def _listed(self, split: str, protocol: str, batch_pairs: int, seed: int = 0) -> DataLoader[PairBatch]:
-        data = self.data(split)
-        sampler = ListSampler(data.table.pairs(protocol, seed), batch_pairs, *self._ranks())
-        return DataLoader(data, batch_size=None, sampler=sampler)
+    def _listed(self, data: PairData, pairs: NDArray[np.int64], batch_pairs: int) -> DataLoader[PairBatch]:
+        return DataLoader(data, batch_size=None, sampler=ListSampler(pairs, batch_pairs, *self._ranks()))
 
 
 @torch.inference_mode()

@@ -105,6 +105,20 @@ class ViewTable:
             chosen.append(pairs[pairs[:, 0] != pairs[:, 1]])
         return np.concatenate(chosen)
 
+    def view_sets(self, views: int) -> NDArray[np.int64]:
+        """Sets of `views` images of an object each, `[S, V]`: every view once as the first, followed by the next ones
+        in the table's order, the object's first again after its last.
+
+        So every view is once the first, second, ... of a set, and no two sets share a first view.
+        """
+        chosen = []
+        for index, name in enumerate(self.names):
+            own = self.views_of(index)
+            if len(own) < views:
+                raise UserError(f"object '{name}' has {len(own)} views here; sets of views={views} need as many")
+            chosen.append(np.stack([np.roll(own, -place) for place in range(views)], axis=1))
+        return np.concatenate(chosen)
+
 
 class Rows:
     """Some rows of a memory-mapped array, numbered anew; read when they are asked for."""

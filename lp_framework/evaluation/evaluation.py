@@ -43,11 +43,15 @@ class Evaluation(LightningModule):
         self.table = table
         self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer)
 
-    def test_step(self, batch: PairBatch, batch_idx: int) -> None:
+    def solve(self, batch: PairBatch) -> Solution:
+        """The solver's solution of a batch's pairs."""
         assert batch.images is not None  # evaluation never caches features
         ids = self.table.pair_ids(batch.pairs).to(self.device)
         pairs = Pairs(batch.images, batch.reference, batch.query, ids)
-        solution = self.solver.solve(pairs, self.starts.make(ids, self.seed), self.seed)
+        return self.solver.solve(pairs, self.starts.make(ids, self.seed), self.seed)
+
+    def test_step(self, batch: PairBatch, batch_idx: int) -> None:
+        solution = self.solve(batch)
         rotation, translation = errors(solution, batch)
         poses = solution.answer().double()
         self.metrics.update(batch.pairs, batch.objects[batch.reference], rotation, translation, solution.chosen, poses)

@@ -82,8 +82,10 @@ def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) 
 
 
 def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, table: ViewTable) -> None:
-    """`results.json`, `results.csv` (a row an object and summary row) and `pairs.csv` (a row a pair) in `folder`."""
-    write_json(folder / "results.json", result)
+    """`results.csv` (a row an object and summary row), `pairs.csv` (a row a pair) and `results.json` in `folder`.
+
+    The last one is written last: where it is, the evaluation is finished.
+    """
     rows = [*summary_rows(result), *((name, row) for name, row in result["per_object"].items() if row is not None)]
     keys = [*COLUMNS, *ERRORS]
     write_csv(
@@ -92,6 +94,7 @@ def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, 
         [[name.strip(), *(round(row[key], 5) for key in keys)] for name, row in rows],
     )
     write_csv(folder / "pairs.csv", PAIR_COLUMNS, pair_rows(metrics, table))
+    write_json(folder / "results.json", result)
 
 
 PAIR_COLUMNS = (

@@ -92,5 +92,7 @@ class Prior(nn.Module, ABC):
         for name, (shape, right) in wanted.items():
             if shape != right:
                 raise UserError(f"{name} must be {list(right)} for {batch} poses, got {list(shape)}")
-        if timestep.is_floating_point() or (batch and not 0 <= timestep.min() <= timestep.max() < self.num_timesteps):
+        known = timestep.device.type == "cpu"  # looking at the values on a GPU would wait for it, at every step
+        outside = batch and known and not 0 <= timestep.min() <= timestep.max() < self.num_timesteps
+        if timestep.is_floating_point() or outside:
             raise UserError(f"timestep must hold integers from 0 to {self.num_timesteps - 1}, got {timestep.tolist()}")

@@ -65,7 +65,7 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
     rows, table = evaluation.metrics.rows(), evaluation.table
     rotation, translation = rows["rotation"].numpy(), rows["translation"].numpy()
     chosen, objects = rows["chosen"].numpy(), rows["object"].numpy()
-    written = []
+    written: list[Path] = []
     answer = rotation[np.arange(len(rotation)), chosen]
     for number, pick in enumerate(pick_pairs(answer, objects, table.unique_answer)):
         views = np.array([divmod(int(rows["pair"][pick.row]), len(table))])
@@ -78,8 +78,15 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
         )
         figure = field_figure(*pair_contents(evaluation, data[views]), title, note)
         written += save_figure(figure, folder / f"field_{number}")
-    classes = [table.ambiguities[index] for index in objects]
-    written += save_figure(errors_figure(rotation, translation, chosen, classes), folder / "errors")
+    return [*(file for file in written if file.suffix == ".png"), *save_summaries(folder, evaluation, data)]
+
+
+def save_summaries(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
+    """After `Trainer.test`, of pairs or sets: the cumulative errors and the objects; as `save_pictures`."""
+    rows, table = evaluation.metrics.rows(), evaluation.table
+    classes = [table.ambiguities[index] for index in rows["object"].tolist()]
+    rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
+    written = save_figure(errors_figure(rotation, translation, chosen, classes), folder / "errors")
     written += save_figure(objects_figure(object_cards(rows, data)), folder / "objects")
     return [file for file in written if file.suffix == ".png"]
 
