@@ -37,7 +37,8 @@ def azimuth_figure(panels: Sequence[AzimuthPanel]) -> Figure:
         axes.axvline(0, color=TRUTH, linewidth=2.5, alpha=0.8, zorder=1)
         above = [energy - min(panel.energy) for energy in panel.energy]
         # The circle is closed: what is at -180 is at 180 as well.
-        axes.plot([*panel.degrees, panel.degrees[0] + 360], [*above, above[0]], color=CLASS_COLOURS[panel.ambiguity], zorder=3)
+        colour = CLASS_COLOURS[panel.ambiguity]
+        axes.plot([*panel.degrees, panel.degrees[0] + 360], [*above, above[0]], color=colour, zorder=3)
         axes.set_title(f"{panel.title.replace('_', ' ')}, {panel.within:.0%}")
         axes.set_xlim(-180, 180)
         degrees(axes, "x", 90)
