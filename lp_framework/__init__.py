@@ -2,8 +2,8 @@
 
     pose = lp_framework.estimate_pose("chair_front.png", "chair_left.png").answer()
 
-    model = lp_framework.load_model("runs/train/2026-01-31_12-00-00")
-    solver = lp_framework.load_solver("langevin", model=model, gamma=0)
+    model = lp_framework.load_model("runs/train/2026-01-31_12-00-00")  # without a run, the one that ships
+    solver = lp_framework.load_solver("two_stage", model=model, prior=lp_framework.load_prior("tiny"), gamma=0)
     starts = lp_framework.make_starts("grid")
 
 Names and arguments are those of the command line. Importing the package imports nothing heavy.
@@ -57,11 +57,15 @@ def estimate_pose(
     return estimate(reference, query, solver, prior, model, starts, seed, crop, remove_background)
 
 
-def load_model(checkpoint: str | Path) -> PoseModel:
-    """The trained model of a checkpoint file or of a training run's folder; `UserError` where it cannot be had."""
+def load_model(checkpoint: str | Path | None = None) -> PoseModel:
+    """The trained model of a checkpoint file or of a training run's folder; None: the one that ships.
+
+    Raises `UserError` where it cannot be had.
+    """
+    from lp_framework.models.checkpoints import SHIPPED
     from lp_framework.models.checkpoints import load_model as load
 
-    return load(checkpoint)
+    return load(SHIPPED / "score" if checkpoint is None else checkpoint)
 
 
 def load_prior(name: str, **arguments: Any) -> Prior:

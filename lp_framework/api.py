@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from torch import Tensor, nn
 
+import lp_framework
 from lp_framework import registry
 from lp_framework.data.pairs import as_images
 from lp_framework.data.photographs import BackgroundRemover, array_image, on_white, prepare, read_image, upright
 from lp_framework.errors import UserError
-from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution, Solver
@@ -54,7 +54,7 @@ def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel |
     wanted = registry.component_names(registry.get("solver", name))
     components: dict[str, Any] = {}
     if "model" in wanted:
-        components["model"] = model if isinstance(model, PoseModel) else load_model(model or SHIPPED / "score")
+        components["model"] = model if isinstance(model, PoseModel) else lp_framework.load_model(model)
     if "prior" in wanted:
         components["prior"] = prior if isinstance(prior, Prior) else registry.build("prior", prior)
     solver: Solver = registry.build("solver", name, **components)

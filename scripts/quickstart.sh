@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The main job from nothing: install, render the embedded objects, train a score model, evaluate it.
+# The main job from nothing: install, render the embedded objects, train a score model, evaluate it with and without
+# the second stage.
 # What is there already is taken as it is; arguments go to the training, e.g. `model=energy`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -17,8 +18,8 @@ else
     $python -m lp_framework train "hydra.run.dir=$run" "$@"
 fi
 echo
-echo "quickstart: the first stage without noise (gamma 0)"
-$python -m lp_framework eval "checkpoint=$run" solver.gamma=0 "hydra.run.dir=$run/eval_gamma_0"
+echo "quickstart: the first stage alone, without noise (gamma 0)"
+$python -m lp_framework eval "checkpoint=$run" solver.gamma=0 "hydra.run.dir=$run/eval_first_stage"
 echo
-echo "quickstart: the first stage with the paper's noise in longitude (gamma 0.3), a spread of 39 degrees by itself"
-$python -m lp_framework eval "checkpoint=$run" solver.gamma=0.3 "hydra.run.dir=$run/eval_gamma_0.3"
+echo "quickstart: both stages, the second one on the prior that ships"
+$python -m lp_framework eval "checkpoint=$run" solver=two_stage solver.gamma=0 "hydra.run.dir=$run/eval_two_stage"

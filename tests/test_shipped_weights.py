@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -99,3 +100,16 @@ def test_the_score_model_finds_the_pose(landscape, folder):
     truth = relative_pose(poses[:1].expand_as(poses), poses)[1:]
     turn = (solver.solve(pairs, starts, seed=0).answer()[:, 1] - truth[:, 1] + math.pi) % (2 * math.pi) - math.pi
     assert turn.abs().max() < math.radians(30)
+
+
+def test_the_readmes_example_finds_the_pose(landscape, folder, monkeypatch, capsys):
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "estimate_pose" in block]
+    monkeypatch.chdir(folder)
+    exec(compile(code, "README.md", "exec"), {})
+    latitude, longitude, radius = (float(part.rstrip("°")) for part in capsys.readouterr().out.split(", "))
+    poses = read_views(folder / "datasets" / "toy", "duck", "test").poses
+    truth = relative_pose(poses[0], poses[4])
+    assert latitude == pytest.approx(math.degrees(truth[0]), abs=6)
+    assert longitude == pytest.approx(math.degrees(truth[1]), abs=6)
+    assert radius == pytest.approx(truth[2].item(), abs=0.1)
