@@ -36,16 +36,22 @@ def jobs(monkeypatch):
     return jobs
 
 
+def plain_noise(gamma):
+    return gamma if gamma is None or isinstance(gamma, float) else tuple(gamma)
+
+
 @pytest.mark.parametrize(
     ("experiment", "narrowed", "varies"),
     [
         ("gamma", (), {("two_stage", gamma) for gamma in (0, 0.1, 0.3, 0.5)}),
-        ("starts", ("start.count=2,8",), {(solver, count) for solver in ("ifusion", "two_stage") for count in (2, 8)}),
+        ("starts", ("start.count=2,8",), {(solver, noise, count) for count in (2, 8) for solver, noise in (
+            ("ifusion", None), ("two_stage", (0.0, 0.3, 0.0)), ("two_stage", 0.0), ("gauss_newton", 0.0))}),
         ("priors", (), {("two_stage", "tiny")}),
         ("score_energy", (), {("two_stage", "runs/score"), ("two_stage", "runs/energy")}),
         ("stages", ("views=2,8",), {(first, second, views) for first, second in ((True, True), (True, False),
                                                                                  (False, True)) for views in (2, 8)}),
-        ("methods", (), {(solver, "grid") for solver in ("langevin", "ifusion", "id_pose", "two_stage")}),
+        ("methods", (), {(solver, "grid") for solver in (
+            "langevin", "ifusion", "id_pose", "two_stage", "gauss_newton")}),
     ],
 )  # fmt: skip
 def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, narrowed, varies):
@@ -53,7 +59,7 @@ def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, n
     assert ran.status == 0, ran.err
     keys = {
         "gamma": lambda c: (c.solver.name, c.solver.gamma),
-        "starts": lambda c: (c.solver.name, c.start.count),
+        "starts": lambda c: (c.solver.name, plain_noise(c.solver.get("gamma")), c.start.count),
         "priors": lambda c: (c.solver.name, c.prior.name),
         "score_energy": lambda c: (c.solver.name, c.checkpoint),
         "stages": lambda c: (c.solver.first_stage, c.solver.second_stage, c.views),
