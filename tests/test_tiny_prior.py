@@ -117,6 +117,12 @@ def test_training_lowers_the_loss_and_says_what_is_next(trained):
     assert f"views prior.path={trained.folder.name}" in trained.out
 
 
+def test_a_backbone_may_be_trained_along(commands):
+    ran = commands.here("along", "train", *PRIOR, "data.image_size=64", "backbone.frozen=false", "trainer.max_epochs=1")
+    assert ran.status == 0, ran.err
+    assert any(key.startswith("backbone.net") for key in ran.checkpoint()["state_dict"])
+
+
 def test_a_resumed_training_ends_where_an_uninterrupted_one_does(commands, trained):
     short = commands.here(
         "short", "train", *PRIOR, "data.image_size=64", "trainer.max_epochs=3", "model.schedule=constant"

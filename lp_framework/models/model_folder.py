@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 from lp_framework.errors import UserError
 
 CONFIG, WEIGHTS = "model.json", "model.safetensors"
-ORIGIN = ("config.yaml", "metrics.csv", "training.png")  # of a run's folder
+ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
 RECIPE = "lp_framework"  # key in a checkpoint: the configs of model and backbone
 
 

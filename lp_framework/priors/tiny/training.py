@@ -84,8 +84,7 @@ class PriorModel(TrainedModule):
         data = self.trainer.datamodule.data("train")  # type: ignore[attr-defined]
         views = torch.arange(len(data.table))
         alone = [data[part[:, None].expand(-1, 2).numpy()] for part in views.split(256)]  # pairs of a view with itself
-        pixels = [self._inputs(batch)[1] for batch in alone]
-        self.networks.latents.fit(torch.cat(pixels).to(self.device))
+        self.networks.latents.fit(torch.cat([self._pixels(batch) for batch in alone]).to(self.device))
 
     # ------------------------------------------------------------ use
 
@@ -96,8 +95,8 @@ class PriorModel(TrainedModule):
     # ------------------------------------------------------------ training
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
-        features, pixels = self._inputs(batch)
-        code, latents = self.networks.encoder(features), self.networks.latents(pixels)
+        pixels = self._pixels(batch)
+        code, latents = self.networks.encoder(self._features(batch)), self.networks.latents(pixels)
         generator = self._generator()
         timestep = torch.randint(len(self.alphas_cumprod), (len(batch),), generator=generator, device=self.device)
         noise = torch.randn(len(batch), latents.shape[1], generator=generator, device=self.device)
@@ -118,21 +117,27 @@ class PriorModel(TrainedModule):
         return loss + self.view_loss * view_loss + image_loss
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
-        features, pixels = self._inputs(batch)
-        latents = self.networks.latents(pixels)
+        latents = self.networks.latents(self._pixels(batch))
         timestep = keyed_bits(self.seed, batch.pairs, count=1).squeeze(-1) % len(self.alphas_cumprod)
         noise = keyed_normal(self.seed, batch.pairs, count=latents.shape[1]).to(latents)
-        error, _ = self._denoise(batch, self.networks.encoder(features), latents, timestep, noise)
+        error, _ = self._denoise(batch, self.networks.encoder(self._features(batch)), latents, timestep, noise)
         self.validation_loss.update(batch.pairs, error)
         self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
 
-    def _inputs(self, batch: PairBatch) -> tuple[Tensor, Tensor]:
-        """Features and pixels of the batch's views."""
+    def _features(self, batch: PairBatch) -> Tensor:
+        """Features of the batch's views, by the head of the backbone or all of it."""
         if batch.features is None:
             assert batch.images is not None  # a batch has one or the other
-            return self.backbone(batch.images), shrink(batch.images)
-        trunk = self.backbone.trunk_dim
-        return self.backbone.head(batch.features[:, :trunk]), batch.features[:, trunk:]
+            return self.backbone(batch.images)
+        features: Tensor = self.backbone.head(batch.features[:, : self.backbone.trunk_dim])
+        return features
+
+    def _pixels(self, batch: PairBatch) -> Tensor:
+        """Pixels of the batch's views, small."""
+        if batch.features is None:
+            assert batch.images is not None
+            return shrink(batch.images)
+        return batch.features[:, self.backbone.trunk_dim :]
 
     def _denoise(
         self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor
