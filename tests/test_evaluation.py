@@ -18,7 +18,7 @@ from tiny_runs import OBJECTS, Commands, Ran
 
 from lp_framework.data.pairs import PairBatch
 from lp_framework.evaluation.evaluation import errors
-from lp_framework.geometry import apply_relative_pose, camera_to_world
+from lp_framework.geometry import camera_to_world, relative_camera, rigid_transform, so3_exp
 from lp_framework.solvers.base import Cost, Solution
 
 METRICS = {f"{kind}@{degrees}" for kind in ("R", "R(R)", "SR", "SR(R)") for degrees in (5, 15, 30)}
@@ -211,9 +211,29 @@ def test_errors_compare_the_querys_predicted_camera_with_its_true_one():
     torch.testing.assert_close(rotation[:, 1], torch.full((2,), 10.0, dtype=torch.float64), rtol=0, atol=1e-3)
     across = 2 * math.sin(math.radians(5)) * (poses[:, 2] * poses[:, 0].cos())[batch.query]
     torch.testing.assert_close(translation[:, 1], across, rtol=1e-4, atol=1e-5)
-    cameras = camera_to_world(apply_relative_pose(poses[batch.reference][:, None], predicted))
-    full = Solution(torch.full_like(predicted, torch.nan), empty, empty == 0, solution.chosen, Cost(0, 0.0), cameras)
-    torch.testing.assert_close(errors(full, batch)[0], rotation, rtol=0, atol=1e-6)
+
+
+def test_full_cameras_are_judged_at_the_scale_that_suits_each_best():
+    poses = torch.tensor([[0.1, 0.3, 1.5], [0.4, 2.0, 1.3]], dtype=torch.float64)
+    batch = PairBatch(
+        images=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
+        reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]), pairs=torch.tensor([1, 2]),
+    )  # fmt: skip
+    true = relative_camera(batch.cameras, batch.cameras.flip(0))[:, None]
+    half = rigid_transform(true[..., :3, :3], true[..., :3, 3] / 2)
+    turned = true @ rigid_transform(so3_exp(torch.tensor([0.0, math.radians(10), 0.0])), torch.zeros(3)).double()
+    aside = rigid_transform(true[..., :3, :3], true[..., :3, 3].roll(1, dims=-1))
+    cameras = torch.cat([half, turned, aside, torch.full_like(true, torch.nan)], dim=1)
+    empty = torch.zeros(2, 4)
+    poses_given = torch.full((2, 4, 3), torch.nan)  # not looked at
+    solution = Solution(poses_given, empty, empty == 0, torch.zeros(2).long(), Cost(0, 0.0), cameras)
+    rotation, translation = errors(solution, batch)
+    assert rotation[:, [0, 2]].max() < 1e-5 and translation[:, :2].max() < 1e-12
+    torch.testing.assert_close(rotation[:, 1], torch.full((2,), 10.0, dtype=torch.float64), rtol=0, atol=1e-5)
+    length = torch.linalg.vector_norm(true[:, 0, :3, 3], dim=-1)
+    cosine = (aside[:, 0, :3, 3] * true[:, 0, :3, 3]).sum(-1) / length.square()
+    torch.testing.assert_close(translation[:, 2], length * (1 - cosine.clamp(min=0).square()).sqrt())
+    assert rotation[:, 3].isnan().all() and translation[:, 3].isnan().all()
 
 
 # ---------------------------------------------------------------- bad checkpoints

@@ -134,6 +134,7 @@ def expected(given: tuple[torch.Tensor, ...]) -> dict[str, Any]:
         "metrics_unique_answer": over([0, 1]),
         "per_object": {name: over([index]) for index, name in enumerate(NAMES)},
         "per_ambiguity": {"unique": over([0]), "twofold": over([1]), "continuous": over([2, 3])},
+        "unanswered": float(np.isnan(rotation[np.arange(len(number)), chosen]).mean()),
         "pairs": len(number),
     }
 

@@ -88,7 +88,8 @@ def test_every_dependency_is_pinned_once_for_a_python():
     project = (ROOT / "pyproject.toml").read_text()
     wanted = re.findall(r"^ +\"([\w-]+)[><=]", project, re.MULTILINE)
     wanted += re.findall(
-        r"\"([\w-]+)(?:\[\w+\])?>=", "".join(re.findall(r"^(?:masks|sweeps|viz|zero123) = .*$", project, re.MULTILINE))
+        r"\"([\w-]+)(?:\[\w+\])?>=",
+        "".join(re.findall(r"^(?:features|masks|sweeps|viz|zero123) = .*$", project, re.MULTILINE)),
     )
     assert {"torch", "diffusers", "plotly", "ruff"} <= set(wanted)
     assert {name.replace("_", "-").lower() for name in wanted} <= pinned

@@ -65,6 +65,8 @@ def run(config: DictConfig) -> None:
     title = f"{choices}, {result['pairs']} {counted}"
     console.print(terminal_table(title, summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
+    if result["unanswered"]:
+        console.print(f"no answer for {result['unanswered']:.1%} of the pairs")
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)
     names = ", ".join(picture.name for picture in pictures)
     console.print(f"pictures: {folder / 'pictures'} ({names})", soft_wrap=True)

@@ -12,7 +12,14 @@ from torchmetrics import SumMetric
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch, ViewTable
 from lp_framework.evaluation.metrics import PoseMetrics
-from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, translation_error
+from lp_framework.geometry import (
+    apply_relative_pose,
+    at_optimal_scale,
+    camera_to_world,
+    relative_camera,
+    rotation_error,
+    translation_error,
+)
 from lp_framework.solvers.base import Pairs, Solution, Solver
 from lp_framework.solvers.starts import Starts
 
@@ -70,11 +77,16 @@ class Evaluation(LightningModule):
 
 
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
-    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one."""
+    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one.
+
+    Full cameras are taken at the scale that suits each best (the paper's Details of Baseline Settings).
+    """
+    true = batch.cameras[batch.query][:, None]
     if solution.cameras is None:
         reference = batch.poses[batch.reference][:, None].double()
         predicted = camera_to_world(apply_relative_pose(reference, solution.poses.double()))
     else:
-        predicted = solution.cameras.double()
-    true = batch.cameras[batch.query][:, None].expand_as(predicted)
+        camera = batch.cameras[batch.reference][:, None]
+        predicted = camera @ at_optimal_scale(solution.cameras.double(), relative_camera(camera, true))
+    true = true.expand_as(predicted)
     return rotation_error(predicted, true), translation_error(predicted, true)

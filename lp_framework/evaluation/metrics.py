@@ -104,7 +104,8 @@ class PoseMetrics(Metric):
         return {state: value[order] for state, value in rows.items()}
 
     def compute(self) -> dict[str, Any]:
-        """`metrics`, `metrics_unique_answer` (None where no object is labelled so), `per_object`, `per_ambiguity`."""
+        """`metrics`, `metrics_unique_answer` (None where no object is labelled so), `per_object`, `per_ambiguity`,
+        `unanswered` (the share of pairs for which the solver had no answer), `pairs`."""
         # Here, and only here, torchmetrics has the states of all processes together.
         self._all_rows = rows = self._gathered()
 
@@ -124,5 +125,6 @@ class PoseMetrics(Metric):
             "per_ambiguity": {
                 name: over([index for index in everything if self.ambiguities[index] == name]) for name in classes
             },
+            "unanswered": rows["rotation"].gather(1, rows["chosen"][:, None]).isnan().double().mean().item(),
             "pairs": len(rows["pair"]),
         }

@@ -21,16 +21,21 @@ from lp_framework.geometry.spherical import (
     view_pose,
     wrap_angle,
 )
+from lp_framework.geometry.two_view import at_optimal_scale, from_opencv, pose_of_relative_camera, relative_camera
 
 __all__ = [
     "PoseErrors",
     "apply_relative_pose",
+    "at_optimal_scale",
     "camera_to_world",
     "from_ifusion",
+    "from_opencv",
     "geodesic_angle",
     "hat",
     "inverse",
     "pose_errors",
+    "pose_of_relative_camera",
+    "relative_camera",
     "relative_pose",
     "rigid_transform",
     "rotation_error",

@@ -78,8 +78,8 @@ class Cost:
 class Solution:
     """`poses` `[B, N, 3]` final relative poses, `energies` `[B, N]` (lower is better, comparable along N), `valid`
     `[B, N]`, `chosen` `[B]` index of the start that is the answer; `cameras` `[B, N, 4, 4]` of solvers that predict
-    full ones (camera to world, in the reference's object frame); `trajectory` `[B, N, steps + 1, 3]` on request,
-    longitudes unreduced.
+    full ones: the query's in the reference's frame, its translation up to a factor (see `geometry.two_view`);
+    `trajectory` `[B, N, steps + 1, 3]` on request, longitudes unreduced.
     """
 
     poses: Tensor

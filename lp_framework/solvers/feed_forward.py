@@ -1,0 +1,152 @@
+"""DUSt3R and VGGT: networks that predict both cameras of a pair at once. The packages are their authors'."""
+
+from __future__ import annotations
+
+import argparse
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from lp_framework.errors import UserError
+from lp_framework.geometry import from_opencv, inverse, relative_camera, rigid_transform
+from lp_framework.registry import register
+from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.matchers import require, weights_error
+from lp_framework.solvers.relative_cameras import RelativeCameraSolver
+
+
+class FeedForward(RelativeCameraSolver):
+    """A network that sees a pair, the reference first, and predicts both cameras, in any frame and at any scale.
+
+    The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`.
+    """
+
+    network: nn.Module
+    patch: int
+    passes_per_pair: int
+
+    def __init__(self, network: nn.Module, image_size: int, reference_radius: float) -> None:
+        super().__init__(reference_radius)
+        if image_size < self.patch or image_size % self.patch:
+            raise UserError(f"solver.image_size must be a multiple of {self.patch}, got {image_size}")
+        self.network, self.image_size = network.eval().requires_grad_(False), image_size
+
+    @abstractmethod
+    def cameras(self, images: Tensor) -> Tensor:
+        """Cameras to world `[2, 4, 4]` with OpenCV's axes of prepared images `[2, 3, H, W]` in [-1, 1]; NaN: none."""
+
+    def prepare(self, images: Tensor) -> Tensor:
+        """Images `[I, 3, H, W]` at the network's size: resampled as Pillow does, in [-1, 1]."""
+        size = (self.image_size, self.image_size)
+        return interpolate(images, size, mode="bicubic", align_corners=False, antialias=True).clamp(-1, 1)
+
+    def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
+        """See `RelativeCameraSolver.predict`; these have no energies, all are 0."""
+        ends = torch.stack([pairs.reference, pairs.query], dim=1)
+        both = torch.stack([self.cameras(self.prepare(pairs.images[pair])).double().cpu() for pair in ends])
+        reference, query = from_opencv(both).unbind(dim=1)
+        energies = torch.zeros(len(pairs), dtype=torch.float64)
+        return relative_camera(reference, query), energies, self.passes_per_pair * len(pairs)
+
+
+@register("solver", "dust3r")
+class Dust3r(FeedForward):
+    """DUSt3R (Wang et al. 2024): point maps of both images, and the cameras that fit them; one answer a pair.
+
+    Needs the authors' package on Python's path (docs/baselines.md). `weights` are a checkpoint file, a folder or a hub
+    id. Images are the authors' own preparation with `square_ok`: whole. The cameras are those of their `PairViewer`:
+    both orders of the images go through the network, and the more confident one's points fix the other camera. See
+    `RelativeCameraSolver` for `reference_radius` and the cameras; starts are ignored.
+    """
+
+    patch, passes_per_pair = 16, 2
+
+    def __init__(
+        self,
+        weights: str = "naver/DUSt3R_ViTLarge_BaseDecoder_512_dpt",
+        image_size: int = 512,
+        reference_radius: float = 1.4,
+    ) -> None:
+        parts = (
+            require(f"dust3r.{part}", "solver=dust3r", "see docs/baselines.md, it is not on the package index")
+            for part in ("model", "inference", "cloud_opt")
+        )
+        model, self.inference, self.alignment = parts
+        torch.serialization.add_safe_globals([argparse.Namespace])  # in its checkpoint files, beside the weights
+        super().__init__(
+            _loaded(model.AsymmetricCroCo3DStereo.from_pretrained, "DUSt3R", weights), image_size, reference_radius
+        )
+
+    def cameras(self, images: Tensor) -> Tensor:
+        """See `FeedForward.cameras`."""
+        shape = torch.tensor([images.shape[-2:]], dtype=torch.int32).numpy()
+        first, second = (
+            {"img": image[None], "true_shape": shape, "idx": index, "instance": str(index)}
+            for index, image in enumerate(images)
+        )
+        output = self.inference.inference([(first, second), (second, first)], self.network, images.device, batch_size=2)
+        mode = self.alignment.GlobalAlignerMode.PairViewer
+        found: Tensor = self.alignment.global_aligner(output, device="cpu", mode=mode, verbose=False).get_im_poses()
+        # Where it finds no camera for the other image's points it puts both at the same place, to the last bit.
+        return torch.full_like(found, torch.nan) if torch.equal(found[0], found[1]) else found
+
+
+@register("solver", "vggt")
+class VGGT(FeedForward):
+    """VGGT (Wang et al. 2025): both cameras from its camera head; one answer a pair.
+
+    Needs the authors' package (docs/baselines.md). `weights` are a checkpoint file, a folder or a hub id. See
+    `RelativeCameraSolver` for `reference_radius` and the cameras; starts are ignored.
+    """
+
+    patch, passes_per_pair = 14, 1
+
+    def __init__(
+        self,
+        weights: str = "facebook/VGGT-1B",
+        image_size: int = 518,
+        reference_radius: float = 1.4,
+    ) -> None:
+        package = "pip install git+https://github.com/facebookresearch/vggt"
+        model = require("vggt.models.vggt", "solver=vggt", package)
+        self.encoding = require("vggt.utils.pose_enc", "solver=vggt", package)
+        super().__init__(_loaded(partial(_load_vggt, model.VGGT), "VGGT", weights), image_size, reference_radius)
+
+    def cameras(self, images: Tensor) -> Tensor:
+        """See `FeedForward.cameras`."""
+        network: Any = self.network
+        batch = (images[None] + 1) / 2
+        with torch.autocast(images.device.type, dtype=torch.bfloat16, enabled=images.is_cuda):  # as published
+            tokens, _ = network.aggregator(batch)
+        encoded = network.camera_head(tokens)[-1]  # of the last refinement
+        world_to_camera, _ = self.encoding.pose_encoding_to_extri_intri(encoded, batch.shape[-2:])
+        matrices = world_to_camera[0].double()  # [2, 3, 4]
+        return inverse(rigid_transform(matrices[..., :3], matrices[..., 3]))
+
+
+def _loaded(load: Callable[[str], nn.Module], name: str, weights: str) -> nn.Module:
+    """What `load` makes of weights; `UserError` where it cannot."""
+    if Path(weights).suffix in (".pt", ".pth", ".safetensors") and not Path(weights).is_file():
+        raise UserError(f"{weights}: there is no such file with the weights of {name}")
+    try:
+        return load(weights)
+    except Exception as error:  # the hub's package and its HTTP libraries have many of their own
+        raise weights_error(name, weights, error) from error
+
+
+def _load_vggt(network: Any, weights: str) -> nn.Module:
+    """VGGT with the weights of a file, or by its own means, which do not read files."""
+    if not Path(weights).is_file():
+        loaded: nn.Module = network.from_pretrained(weights)
+        return loaded
+    loaded = network()
+    safe = weights.endswith(".safetensors")
+    loaded.load_state_dict(load_file(weights) if safe else torch.load(weights, map_location="cpu", weights_only=True))
+    return loaded

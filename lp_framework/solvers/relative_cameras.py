@@ -1,0 +1,48 @@
+"""Solvers that see two images, predict one relative camera, and need neither starts nor descent."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from lp_framework.errors import UserError
+from lp_framework.geometry import pose_of_relative_camera
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts
+
+
+class RelativeCameraSolver(Solver):
+    """One answer a pair (N = 1), **starts are ignored**; a pair without an answer is invalid and its pose NaN.
+
+    The `Solution` has full cameras, whose translations are known up to a factor. Its poses are theirs as
+    `pose_of_relative_camera` has them, with the reference `reference_radius` (object sizes) from the object's centre;
+    1.4 is where `estimate` puts that of prepared photographs.
+    """
+
+    def __init__(self, reference_radius: float) -> None:
+        if not reference_radius > 0:
+            raise UserError(f"solver.reference_radius must be positive, got {reference_radius}")
+        self.reference_radius = reference_radius
+
+    @abstractmethod
+    def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
+        """Relative cameras `[B, 4, 4]` (float64, see `geometry.two_view`; NaN where there is none), energies `[B]`,
+        and passes through the network."""
+
+    @torch.no_grad()
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        """See `Solver.solve` and the class."""
+        check_starts(pairs, starts)
+        began = time.perf_counter()
+        cameras, energies, passes = self.predict(pairs, seed)
+        poses = pose_of_relative_camera(cameras, self.reference_radius)
+        return Solution(
+            poses=poses.to(starts)[:, None],
+            energies=energies.to(starts)[:, None],
+            valid=cameras.isfinite().all(dim=-1).all(dim=-1).to(starts.device)[:, None],
+            chosen=torch.zeros(len(pairs), dtype=torch.int64, device=starts.device),
+            cost=Cost(network_passes=passes, seconds=time.perf_counter() - began),
+            cameras=cameras.to(starts)[:, None],
+        )
