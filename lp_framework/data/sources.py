@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import trimesh
 
@@ -11,6 +12,7 @@ from lp_framework.data.meshes import MeshObject, load_scene
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
+from lp_framework.data.sets.object_lists import drawn, kept_lists
 from lp_framework.data.toy import toy_objects
 from lp_framework.errors import UserError
 from lp_framework.registry import register
@@ -77,13 +79,19 @@ class ToyData(RenderedData):
 
 @register("data", "meshes")
 class MeshData(RenderedData):
-    """A folder of meshes, in any formats that trimesh reads; rendered into `views`."""
+    """A folder of meshes, in any formats that trimesh reads; rendered into `views`.
+
+    `unseen` of its objects are kept from training; `objects` says whether these or the others are in use.
+    """
 
     def __init__(
         self,
         renderer: Renderer,
         path: str,
         views: str | None = None,
+        unseen: int = 0,
+        objects: Literal["seen", "unseen"] = "seen",
+        split_seed: int = 0,
         resolution: int = 512,
         test_views: int = 8,
         latitude_step_degrees: float = 7.5,
@@ -99,6 +107,7 @@ class MeshData(RenderedData):
         self.meshes = Path(path)
         folder = views if views is not None else f"datasets/{self.meshes.resolve().name}"
         super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
+        self.unseen, self.which, self.split_seed = unseen, objects, split_seed
         self.renderer, self.workers = renderer, workers
         self.protocol = ViewProtocol(
             resolution=resolution,
@@ -108,13 +117,21 @@ class MeshData(RenderedData):
         )
 
     def objects(self) -> list[MeshObject]:
-        """One object a mesh file, named after it, sorted by name."""
+        """One object a mesh file, named after it, sorted by name; of a divided folder the seen or the unseen ones."""
         if not self.meshes.is_dir():
             raise UserError(f"{self.meshes}: there is no such folder of meshes; give data.path=FOLDER")
         formats = {f".{suffix}" for suffix in trimesh.available_formats()}
         files = sorted(file for file in self.meshes.iterdir() if file.suffix.lower() in formats and file.name[0] != ".")
         if not files:
             raise UserError(f"{self.meshes}: holds no mesh file (known formats: {', '.join(sorted(formats))})")
+        if self.unseen or self.which == "unseen":
+            names = [file.stem for file in files]
+            lists = kept_lists(
+                self.path,
+                {"unseen": self.unseen, "split_seed": self.split_seed},
+                lambda: drawn(names, None, self.unseen, self.split_seed, self.meshes),
+            )
+            files = [file for file in files if file.stem in lists.named(self.which)]
         return [MeshObject(file.stem, "unlabelled", partial(load_scene, file)) for file in files]
 
 

@@ -1,0 +1,294 @@
+"""Photographs with cameras, converted once into views on disk; everything after that is as with rendered views.
+
+A data set says which photographs an object has, where their cameras are and how large the object is. From them come
+object-centric crops by `real_cameras`, chosen so that their viewpoints are spread evenly. An object is written into a
+hidden folder that is renamed when all of it is there; the download itself is only read. `conversion.json` beside an
+object's views says what they were made from and what was left out.
+
+Beside what every `transform.json` has, a frame keeps its photograph (`source`, `width`, `height`), its camera
+(`photograph_camera`, in the object's frame, and `photograph_intrinsics`, pixels), the `turn_degrees` and
+`crop_angle_degrees` of its crop, and its `perspective_residual`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from filelock import FileLock
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from lp_framework.data.cache import tracked
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.photographs import HALF, read_image
+from lp_framework.data.real_cameras import (
+    FIELD_OF_VIEW_DEGREES,
+    crop_field_of_view,
+    crop_homography,
+    effective_radii,
+    perspective_residual,
+    spherical_camera,
+    turn_towards_centre,
+)
+from lp_framework.errors import UserError
+from lp_framework.geometry import to_ifusion, view_pose
+from lp_framework.keyed_random import stable_id
+
+RECORD = "conversion.json"
+LARGEST_PERSPECTIVE = 0.25  # of the image's side; a view whose crop differs more from a spherical camera's is left out
+NEAREST = 1.0  # units of the object's longest side; a camera nearer than that is left out
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph of an object: its file, its mask's, its camera `[4, 4]` (camera to world, OpenGL axes, float64) in
+    the object's frame (see `real_cameras`), its intrinsics `[3, 3]` in pixels and its size (width, height)."""
+
+    file: Path
+    mask: Path
+    camera: Tensor
+    intrinsics: Tensor
+    size: tuple[int, int]
+
+
+class ConvertedData(PairDataModule):
+    """Views that are converted from photographs on first use.
+
+    `source` is the download, `path` the folder of views. `train_views` and `test_views` photographs of each object are
+    taken, chosen with `split_seed`; their crops are `resolution` pixels a side.
+    """
+
+    source: Path
+    train_views: int
+    test_views: int
+    resolution: int
+    split_seed: int
+
+    def photographs(self, name: str) -> tuple[list[Photograph], Tensor, Counter[str]]:
+        """An object's photographs, points `[P, 3]` on its bounding box, and how many were left out for which reason."""
+        raise NotImplementedError
+
+    def demands(self) -> dict[str, Any]:
+        """What of the settings decides an object's views, as plain values."""
+        return {
+            "source": self.source.resolve().name,
+            "train_views": self.train_views,
+            "test_views": self.test_views,
+            "resolution": self.resolution,
+            "split_seed": self.split_seed,
+        }
+
+    def prepare_data(self) -> None:
+        """Convert what is not there yet, then as every data set."""
+        self._check_settings()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            with FileLock(self.path / ".convert.lock"):
+                missing = [name for name in self.names() if not is_converted(self.path / name, self.demands())]
+                for name in tracked(missing, "converting photographs"):
+                    self._convert(name)
+        except OSError as error:
+            raise UserError(
+                f"{self.path}: cannot be written ({error.strerror}); the objects finished so far are kept"
+            ) from error
+        super().prepare_data()
+
+    def _check_settings(self) -> None:
+        counts = (("train_views", self.train_views, 2), ("test_views", self.test_views, 2))
+        for name, value, least in (*counts, ("resolution", self.resolution, 16)):
+            if value < least:
+                raise UserError(f"data.{name} must be at least {least}, got {value}")
+
+    def _convert(self, name: str) -> None:
+        photographs, points, left_out = self.photographs(name)
+        views, more = sound_views(photographs, points)
+        left_out += more
+        wanted = self.train_views + self.test_views
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items()))
+        if len(views) < wanted:
+            raise UserError(
+                f"{self.source}: object '{name}' has {len(views)} usable views"
+                f"{f' ({reasons} are left out)' if reasons else ''}, but data.train_views={self.train_views} and "
+                f"data.test_views={self.test_views} ask for {wanted}"
+            )
+        if reasons:
+            warnings.warn(f"{self.source}: object '{name}': {reasons} are left out", stacklevel=2)
+        places = torch.stack([view.photograph.camera[:3, 3] for view in views])
+        directions = torch.nn.functional.normalize(places, dim=-1).numpy()
+        random = np.random.default_rng([self.split_seed, stable_id(name)])
+        chosen = spread(directions, wanted, random)
+        test = set(random.choice(chosen, self.test_views, replace=False).tolist())
+        splits = {
+            "train": [views[index] for index in sorted(chosen) if index not in test],
+            "test": [views[index] for index in sorted(test)],
+        }
+        residuals = [view.residual for split in splits.values() for view in split]
+        record = {
+            "object": name,
+            **self.demands(),
+            "left_out": dict(left_out),
+            "median_perspective_residual": float(np.median(residuals)),
+            "largest_perspective_residual": max(residuals),
+            "largest_turn_degrees": max(view.turn for split in splits.values() for view in split),
+        }
+
+        def write(folder: Path) -> None:
+            for split, chosen_views in splits.items():
+                (folder / split / "rgb").mkdir(parents=True)
+                frames = []
+                for index, view in enumerate(chosen_views):
+                    file = f"{index:03d}.png"
+                    crop(view, self.resolution).save(folder / split / "rgb" / file, compress_level=1)
+                    frames.append({"file_path": file, **view.frame(self.source)})
+                write_transforms(folder / split, frames)
+
+        write_converted(self.path / name, record, write)
+
+
+def write_transforms(folder: Path, frames: list[dict[str, Any]]) -> None:
+    """The `transform.json` of a split with the priors' field of view."""
+    content = {"camera_angle_x": math.radians(FIELD_OF_VIEW_DEGREES), "frames": frames}
+    (folder / "transform.json").write_text(json.dumps(content, indent=1))
+
+
+def is_converted(folder: Path, demands: dict[str, Any]) -> bool:
+    """Whether a folder holds an object's views that were made as its record, and `demands`, say."""
+    try:
+        record = json.loads((folder / RECORD).read_text())
+        return all(record[key] == value for key, value in demands.items())
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def write_converted(folder: Path, record: dict[str, Any], write: Callable[[Path], None]) -> None:
+    """Have an object's views written, with their record, whole or not at all; `UserError` where the folder is there."""
+    if folder.exists():
+        raise UserError(
+            f"{folder}: holds other views than these settings make (see its {RECORD}); choose another data.views or "
+            "delete it"
+        )
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+    try:
+        partial.mkdir()
+        write(partial)
+        (partial / RECORD).write_text(json.dumps(record, indent=1))
+        os.rename(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+# ---------------------------------------------------------------- choosing
+
+
+@dataclass(frozen=True)
+class SphericalView:
+    """A photograph with the effective radius of its crop (units of the object's longest side), the angle of its virtual
+    turn (degrees) and its perspective residual (units of the image's side)."""
+
+    photograph: Photograph
+    radius: Tensor
+    turn: float
+    residual: float
+
+    def frame(self, source: Path) -> dict[str, Any]:
+        """What `transform.json` says of it, but for the file."""
+        photograph = self.photograph
+        camera = spherical_camera(photograph.camera, self.radius)
+        angle = crop_field_of_view(photograph.camera[:3, 3].norm(), self.radius)
+        file = photograph.file
+        return {
+            "transform_matrix": camera.tolist(),
+            "latlon": to_ifusion(view_pose(camera)).tolist(),
+            "source": str(file.relative_to(source) if file.is_relative_to(source) else file),
+            "width": photograph.size[0],
+            "height": photograph.size[1],
+            "photograph_camera": photograph.camera.tolist(),
+            "photograph_intrinsics": photograph.intrinsics.tolist(),
+            "turn_degrees": self.turn,
+            "crop_angle_degrees": math.degrees(angle.item()),
+            "perspective_residual": self.residual,
+        }
+
+
+def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list[SphericalView], Counter[str]]:
+    """The views of an object that are near enough to a spherical camera's, and how many are not, by reason.
+
+    `points` `[P, 3]` are on its bounding box; the perspective residual is theirs.
+    """
+    left_out: Counter[str] = Counter()
+    if not photographs:
+        return [], left_out
+    cameras = torch.stack([photograph.camera for photograph in photographs])
+    distances = cameras[:, :3, 3].norm(dim=-1)
+    radii = effective_radii(distances)
+    residuals = perspective_residual(cameras, radii, points)
+    _, turns = turn_towards_centre(cameras)
+    views = []
+    for index, photograph in enumerate(photographs):
+        if distances[index] < NEAREST:
+            left_out["nearer than the object is long"] += 1
+        elif not residuals[index] <= LARGEST_PERSPECTIVE:
+            left_out["with too strong a perspective"] += 1
+        else:
+            views.append(SphericalView(photograph, radii[index], turns[index].item(), residuals[index].item()))
+    return views, left_out
+
+
+def spread(directions: NDArray[np.floating], count: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """Indices `[count]` of unit vectors `[V, 3]` that are spread evenly: a random one, then ever the one that is
+    farthest from those already there (farthest-point sampling)."""
+    chosen = [int(random.integers(len(directions)))]
+    nearest = directions @ directions[chosen[0]]
+    while len(chosen) < count:
+        nearest[chosen] = np.inf
+        chosen.append(int(nearest.argmin()))
+        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
+    return np.array(chosen)
+
+
+# ---------------------------------------------------------------- pixels
+
+
+def crop(view: SphericalView, size: int) -> Image.Image:
+    """The object-centric crop of a photograph, RGBA of `size` pixels a side, transparent where the mask is dark and
+    beyond the photograph. `UserError` for a file that cannot be read and for a size that is not the annotation's."""
+    photograph = view.photograph
+    image, mask = read_image(photograph.file).convert("RGB"), read_image(photograph.mask).convert("L")
+    for file, found in ((photograph.file, image.size), (photograph.mask, mask.size)):
+        if found != photograph.size:
+            width, height = photograph.size
+            raise UserError(f"{file}: is {found[0]} x {found[1]} pixels, the photograph should be {width} x {height}")
+    cut = image.convert("RGBA")
+    cut.putalpha(mask)
+    homography = crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
+    # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing.
+    larger = max(1, math.ceil(_magnification(homography, size) - 0.05))
+    homography = homography / torch.tensor([larger, larger, 1.0], dtype=torch.float64)
+    coefficients = (homography / homography[2, 2]).flatten()[:8].tolist()
+    sides = (size * larger, size * larger)
+    warped = cut.transform(sides, Image.Transform.PERSPECTIVE, coefficients, Image.Resampling.BICUBIC).reduce(larger)
+    pixels = np.array(warped)
+    if not (pixels[..., 3] >= HALF).any():
+        raise UserError(f"{photograph.mask}: marks nothing where the annotation has the object")
+    pixels[pixels[..., 3] == 0] = 0
+    return Image.fromarray(pixels)
+
+
+def _magnification(homography: Tensor, size: int) -> float:
+    """Pixels of the photograph that one of the crop is wide, in its middle."""
+    middle = torch.tensor([[size / 2, size / 2, 1.0], [size / 2 + 1, size / 2, 1.0]], dtype=torch.float64)
+    seen = middle @ homography.mT
+    return (seen[1, :2] / seen[1, 2] - seen[0, :2] / seen[0, 2]).norm().item()

@@ -1,0 +1,86 @@
+"""Which objects of a data set are seen and unseen: chosen once, written beside the views, and read from there.
+
+`objects.json` in the folder of views: `{"chosen": {how}, "seen": [names], "unseen": [names]}`. So a later run, with
+more of the data set downloaded, has the same objects; and the names that a result is about are on record.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock
+
+from lp_framework.errors import UserError
+
+LIST = "objects.json"
+
+
+@dataclass(frozen=True)
+class ObjectLists:
+    """Names of the objects to train on (`seen`) and of those kept for evaluation (`unseen`), each sorted."""
+
+    seen: list[str]
+    unseen: list[str]
+
+    def named(self, which: str) -> list[str]:
+        """The list called "seen" or "unseen"; `UserError` where it is empty."""
+        names = self.unseen if which == "unseen" else self.seen
+        if not names:
+            raise UserError(f"data.objects={which}: there are none; set data.unseen to the number of unseen objects")
+        return names
+
+
+def drawn(available: Sequence[str], seen: int | None, unseen: int, seed: int, where: Path) -> ObjectLists:
+    """A seeded choice of `seen` (None: all others) and `unseen` objects among those available.
+
+    Raises `UserError`, naming the place, where there are too few.
+    """
+    names = sorted(available)
+    least = (1 if seen is None else seen) + unseen
+    if min(unseen, least - unseen) < 0 or least == 0:
+        raise UserError(f"{where}: the numbers of objects must not be negative, got {seen} seen and {unseen} unseen")
+    if len(names) < least:
+        raise UserError(
+            f"{where}: {len(names)} objects are there, {least} are needed ({least - unseen} seen and {unseen} unseen)"
+        )
+    order = [names[index] for index in np.random.default_rng(seed).permutation(len(names))]
+    return ObjectLists(sorted(order[unseen:] if seen is None else order[unseen:least]), sorted(order[:unseen]))
+
+
+def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectLists]) -> ObjectLists:
+    """The lists in the folder `views`, chosen and written there where there are none yet.
+
+    `how` (plain values) says how they are chosen; `UserError` where those that are there were chosen otherwise.
+    """
+    path = views / LIST
+    if not path.exists():
+        lists = choose()
+        try:
+            views.mkdir(parents=True, exist_ok=True)
+            with FileLock(views / ".objects.lock"):
+                if not path.exists():
+                    partial = path.with_suffix(".partial")
+                    partial.write_text(
+                        json.dumps({"chosen": how, "seen": lists.seen, "unseen": lists.unseen}, indent=1)
+                    )
+                    partial.replace(path)
+        except OSError as error:
+            raise UserError(f"{views}: cannot be written ({error.strerror}); choose another folder") from error
+    try:
+        content = json.loads(path.read_text())
+        found, lists = content["chosen"], ObjectLists(list(content["seen"]), list(content["unseen"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: is no list of objects as this program writes it; delete it to choose anew") from error
+    differences = [
+        f"{key} was {found.get(key)}, is {how.get(key)}" for key in {**found, **how} if found.get(key) != how.get(key)
+    ]
+    if differences:
+        raise UserError(
+            f"{path}: its objects were chosen otherwise ({'; '.join(differences)}); choose another folder of views"
+        )
+    return lists

@@ -1,0 +1,285 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from painted_cube import SIDES, check_view, photograph
+from PIL import Image
+
+from lp_framework import registry
+from lp_framework.data.sets.converted import Photograph, SphericalView, crop, sound_views, spread
+from lp_framework.data.sets.hopev2 import HOPEv2Data
+from lp_framework.data.views import read_views
+from lp_framework.errors import UserError
+from lp_framework.geometry import camera_to_world, inverse, rigid_transform, so3_exp, view_pose
+
+SIZE = (320, 240)
+LONGEST = 80.0  # millimetres
+CENTRE = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)  # of the box in the model's frame, millimetres
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+TO_Z_UP = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)  # x, y, z there are Z, X, Y here
+
+
+def real_cameras(count: int, seed: int = 0) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Cameras in the object's frame, 4 to 9 times its length away, off-axis and rolled, with their intrinsics."""
+    random = np.random.default_rng(seed)
+    cameras = []
+    for _ in range(count):
+        low, high = [-1.0, 0.0, 4.0], [1.2, 2 * math.pi, 9.0]
+        camera = camera_to_world(torch.from_numpy(random.uniform(low, high)))
+        off = so3_exp(torch.from_numpy(random.uniform([-0.06, -0.06, -3], [0.06, 0.06, 3])))
+        focal = random.uniform(450, 600)
+        intrinsics = torch.tensor([[focal, 0, 157.3], [0, focal * 1.02, 121.7], [0, 0, 1]], dtype=torch.float64)
+        cameras.append((rigid_transform(camera[:3, :3] @ off, camera[:3, 3]), intrinsics))
+    return cameras
+
+
+def annotation(camera: torch.Tensor) -> tuple[list[float], list[float]]:
+    """cam_R_m2c and cam_t_m2c of a camera in the object's frame."""
+    world_to_camera = FLIP @ inverse(camera)
+    # From the model's frame: centred, scaled, and its +Z made +Y.
+    rotation = world_to_camera[:3, :3] @ TO_Z_UP.mT
+    translation = world_to_camera[:3, 3] * LONGEST - rotation @ CENTRE
+    return rotation.flatten().tolist(), translation.tolist()
+
+
+def write_scene(folder: Path, cameras: list, object_id: int = 1, visible: float = 0.95, suffix: str = ".png") -> None:
+    """A scene with one annotated instance an image, preceded by one of an object of no interest."""
+    for name in ("rgb", "mask_visib", "mask", "depth"):
+        (folder / name).mkdir(parents=True)
+    content: dict[str, dict] = {"scene_camera.json": {}, "scene_gt.json": {}, "scene_gt_info.json": {}}
+    for index, (camera, intrinsics) in enumerate(cameras):
+        image = 3 * index  # numbers of images need not be consecutive
+        colours, mask = photograph(camera, intrinsics, SIZE)
+        Image.fromarray(colours).save(folder / "rgb" / f"{image:06d}{suffix}", quality=98)
+        Image.fromarray(mask).save(folder / "mask_visib" / f"{image:06d}_000001.png")
+        Image.fromarray(0 * mask).save(folder / "mask_visib" / f"{image:06d}_000000.png")
+        rotation, translation = annotation(camera)
+        pixel_centres = intrinsics - torch.tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        content["scene_camera.json"][str(image)] = {"cam_K": pixel_centres.flatten().tolist(), "depth_scale": 1.0}
+        other = {"obj_id": 2, "cam_R_m2c": rotation, "cam_t_m2c": translation}
+        content["scene_gt.json"][str(image)] = [other, {**other, "obj_id": object_id}]
+        content["scene_gt_info.json"][str(image)] = [{"visib_fract": 0.0}, {"visib_fract": visible}]
+    for file, entries in content.items():
+        (folder / file).write_text(json.dumps(entries))
+
+
+def write_hopev2(root: Path, views: int = 9) -> Path:
+    """A data set in BOP format with one object, in a scene of `val` and, partly hidden, in one of `val_realsense`."""
+    sides = (LONGEST * torch.tensor(SIDES, dtype=torch.float64))[[2, 0, 1]]  # x, y, z of the model
+    low = (CENTRE - sides / 2).tolist()
+    info = {"diameter": 100.0}
+    info |= {f"min_{axis}": value for axis, value in zip("xyz", low, strict=True)}
+    info |= {f"size_{axis}": value for axis, value in zip("xyz", sides.tolist(), strict=True)}
+    (root / "models").mkdir(parents=True)
+    (root / "models" / "models_info.json").write_text(json.dumps({"1": info}))
+    write_scene(root / "val" / "000001", real_cameras(views))
+    write_scene(root / "val_realsense" / "000002", real_cameras(3, seed=1), visible=0.3)
+    (root / "test" / "000003" / "rgb").mkdir(parents=True)  # without public annotations
+    (root / "test" / "000003" / "scene_camera.json").write_text("{}")
+    return root
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    return write_hopev2(tmp_path / "hope")
+
+
+@pytest.fixture
+def make(root, tmp_path):
+    def build(**changes) -> HOPEv2Data:
+        settings = {"train_views": 5, "test_views": 3, "resolution": 96, "image_size": 32, "validation_views": 0}
+        views, cache = str(tmp_path / "views"), str(tmp_path / "cache")
+        return HOPEv2Data(str(root), **{"views": views, "cache": cache, **settings, **changes})
+
+    return build
+
+
+# ---------------------------------------------------------------- conversion
+
+
+def test_crops_show_what_their_spherical_cameras_see(make, root, tmp_path):
+    assert registry.get("data", "hopev2") is HOPEv2Data
+    data = make()
+    with pytest.warns(UserWarning, match="object 'obj_000001': 3 occluded are left out"):
+        data.prepare_data()
+    assert data.names() == ["obj_000001"]
+    assert data.table("train").counts == [5] and data.table("test").counts == [3]
+    known = torch.stack([camera for camera, _ in real_cameras(9)])
+    sources = set()
+    for split in ("train", "test"):
+        views = read_views(tmp_path / "views", "obj_000001", split)
+        frames = json.loads((tmp_path / "views" / "obj_000001" / split / "transform.json").read_text())["frames"]
+        for file, camera, frame in zip(views.files, views.cameras, frames, strict=True):
+            number = int(Path(frame["source"]).stem) // 3
+            sources.add(frame["source"])
+            true, intrinsics = real_cameras(9)[number]
+            # The photograph's own camera is on record ...
+            recorded = torch.tensor(frame["photograph_camera"], dtype=torch.float64)
+            torch.testing.assert_close(recorded, true, rtol=0, atol=1e-9)
+            recorded = torch.tensor(frame["photograph_intrinsics"], dtype=torch.float64)
+            torch.testing.assert_close(recorded, intrinsics, rtol=0, atol=1e-9)
+            assert (frame["width"], frame["height"]) == SIZE
+            # ... the view is from its direction, at a radius of rendered views ...
+            pose = view_pose(camera)
+            torch.testing.assert_close(pose[:2], view_pose(known[number])[:2], rtol=0, atol=1e-9)
+            assert 1.2 - 1e-9 <= pose[2] <= 2.0 + 1e-9
+            # ... and its pixels are those of the box, seen from the real distance with the crop's field of view.
+            pixels = np.asarray(Image.open(file))
+            assert pixels.shape == (96, 96, 4) and not pixels[pixels[..., 3] == 0].any()
+            real = camera_to_world(view_pose(known[number]))
+            assert check_view(pixels, real, math.radians(frame["crop_angle_degrees"])) < 0.1
+            assert 0 < frame["perspective_residual"] < 0.15
+    assert len(sources) == 8 and all(source.startswith("val/000001/rgb/") for source in sources)
+
+
+def test_relative_radii_follow_the_distances(make, tmp_path):
+    with pytest.warns(UserWarning):
+        make().prepare_data()
+    frames = json.loads((tmp_path / "views" / "obj_000001" / "train" / "transform.json").read_text())["frames"]
+    pairs = [(np.linalg.norm(np.array(f["photograph_camera"])[:3, 3]), f["latlon"][2]) for f in frames]
+    inside = [distance / radius for distance, radius in pairs if 1.2 < radius < 2.0]
+    assert len(inside) >= 2 and np.ptp(inside) < 1e-9
+
+
+def test_a_download_is_left_alone_and_converted_once(make, root, tmp_path):
+    before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
+    with pytest.warns(UserWarning):
+        make().prepare_data()
+    assert {file: file.read_bytes() for file in root.rglob("*") if file.is_file()} == before
+    record = tmp_path / "views" / "obj_000001" / "conversion.json"
+    stamp, content = record.stat().st_mtime_ns, json.loads(record.read_text())
+    assert content["left_out"] == {"occluded": 3} and content["largest_turn_degrees"] > 10
+    make().prepare_data()
+    assert record.stat().st_mtime_ns == stamp
+    with pytest.warns(UserWarning), pytest.raises(UserError, match="holds other views than these settings make"):
+        make(train_views=4).prepare_data()
+
+
+def test_images_may_be_jpegs_of_an_onboarding_sequence(make, root):
+    write_scene(root / "onboarding_static" / "obj_000001_up", real_cameras(8, seed=4), suffix=".jpg")
+    with pytest.warns(UserWarning):
+        make(train_views=12).prepare_data()  # more than there are in `val`
+
+
+def test_a_crop_that_shrinks_the_photograph_is_averaged_not_sampled(tmp_path):
+    size = (600, 600)
+    camera, _ = real_cameras(1)[0]
+    intrinsics = torch.tensor([[2000.0, 0, 300], [0, 2000, 300], [0, 0, 1]], dtype=torch.float64)
+    camera = camera_to_world(view_pose(camera))
+    colours, mask = photograph(camera, intrinsics, size)
+    colours[::2, ::2] = 255 - colours[::2, ::2]  # detail that is finer than the crop can show
+    Image.fromarray(colours).save(tmp_path / "image.png")
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    taken = Photograph(tmp_path / "image.png", tmp_path / "mask.png", camera, intrinsics, size)
+    radius = torch.tensor(1.6, dtype=torch.float64)
+    pixels = np.asarray(crop(SphericalView(taken, radius, 0.0, 0.0), 64)).astype(int)
+    inside = pixels[..., 3] == 255
+    assert inside.sum() > 200
+    # A quarter of the pixels is inverted: everywhere the mean is 3/4 of a colour and 1/4 of its inverse.
+    Image.fromarray(photograph(camera, intrinsics, size)[0]).save(tmp_path / "image.png")
+    smooth = np.asarray(crop(SphericalView(taken, radius, 0.0, 0.0), 64)).astype(int)
+    expected = 0.75 * smooth[..., :3] + 0.25 * (255 - smooth[..., :3])
+    assert np.abs(pixels[..., :3] - expected)[inside].mean() < 6
+
+
+def test_viewpoints_are_spread():
+    random = np.random.default_rng(0)
+    crowd = np.concatenate(
+        [np.tile([0.0, 0.0, 1.0], (90, 1)) + 0.01 * random.normal(size=(90, 3)), np.eye(3), -np.eye(3)]
+    )
+    crowd /= np.linalg.norm(crowd, axis=1, keepdims=True)
+    chosen = spread(crowd, 7, random)
+    assert len(set(chosen.tolist())) == 7 and len(set(chosen.tolist()) & set(range(90, 96))) >= 5
+    assert sorted(spread(crowd, len(crowd), random)) == list(range(len(crowd)))
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def rewrite(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def scene(root: Path, file: str) -> Path:
+    return root / "val" / "000001" / file
+
+
+def entry(key: str, value):
+    return lambda content: content["0"][1].update({key: value})
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda root: scene(root, "scene_camera.json").unlink(), r"000001/scene_camera\.json: there is no such file"),
+        (lambda root: scene(root, "scene_gt_info.json").unlink(), r"scene_gt_info\.json: there is no such file"),
+        (lambda root: scene(root, "scene_gt.json").write_text("{"), r"000001/scene_gt\.json: is not readable JSON"),
+        (lambda root: (root / "models/models_info.json").unlink(), r"models/models_info\.json: there is no such file"),
+        (lambda root: (root / "models/models_info.json").write_text('{"1": {}}'), r"needs min_x, size_x"),
+        (lambda root: rewrite(scene(root, "scene_gt_info.json"), lambda c: c.pop("0")), "of the same instances"),
+        (lambda root: rewrite(scene(root, "scene_camera.json"), lambda c: c.pop("0")), "cam_K of image 0 must be 9"),
+        (lambda root: rewrite(scene(root, "scene_gt.json"), entry("cam_R_m2c", [1.0] * 9)), "is not a rotation"),
+        (lambda root: rewrite(scene(root, "scene_gt.json"), entry("cam_t_m2c", [0, 0, None])), "3 finite numbers"),
+        (lambda root: rewrite(scene(root, "scene_gt.json"), entry("cam_t_m2c", [0, 0, -400])), "behind its camera"),
+        (
+            lambda root: rewrite(scene(root, "scene_camera.json"), lambda c: c["0"].update(cam_K=[0.0] * 9)),
+            "no positive focal lengths",
+        ),
+        (lambda root: scene(root, "rgb/000000.png").unlink(), r"rgb/000000\.png: there is no such image"),
+        (lambda root: scene(root, "rgb/000000.png").write_bytes(b"no"), r"rgb/000000\.png: is not a readable image"),
+        (lambda root: scene(root, "mask_visib/000000_000001.png").unlink(), "000001.png: there is no such mask"),
+        (
+            lambda root: Image.new("L", (80, 60), 255).save(scene(root, "mask_visib/000000_000001.png")),
+            r"000000_000001\.png: is 80 x 60 pixels, the photograph should be 320 x 240",
+        ),
+        (
+            lambda root: Image.new("L", SIZE).save(scene(root, "mask_visib/000000_000001.png")),
+            r"000000_000001\.png: marks nothing",
+        ),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:.*are left out")
+def test_damaged_data(make, root, tmp_path, damage, message):
+    damage(root)
+    with pytest.raises(UserError, match=message) as caught:
+        make(train_views=6).prepare_data()
+    assert "\n" not in str(caught.value)
+    assert not list((tmp_path / "views").glob("*obj*"))
+
+
+def test_an_object_with_fewer_views_than_asked(make):
+    with pytest.raises(
+        UserError, match=r"'obj_000001' has 9 usable views \(3 occluded are left out\).*train_views=100 .* ask for 103"
+    ):
+        make(train_views=100).prepare_data()
+    with pytest.raises(UserError, match=r"data\.test_views must be at least 2, got 1"):
+        make(test_views=1).prepare_data()
+
+
+def test_wrong_roots(make, root, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for path, message in (
+        ("nowhere", "there is no such folder"),
+        ("empty", r"empty/models/models_info\.json: there is"),
+    ):
+        with pytest.raises(UserError, match=message):
+            HOPEv2Data(str(tmp_path / path), views=str(tmp_path / "views")).names()
+    with pytest.raises(UserError, match=r"no annotated scenes; looked for .*hope/train/\*/scene_gt\.json"):
+        make(splits=["train"]).prepare_data()
+
+
+def test_views_too_near_or_too_distorted_are_left_out_and_counted():
+    cameras = [camera_to_world(torch.tensor([0.2, angle, 6.0], dtype=torch.float64)) for angle in (0.0, 1.0, 2.0)]
+    cameras += [camera_to_world(torch.tensor([0.2, 3.0, distance], dtype=torch.float64)) for distance in (0.7, 1.5)]
+    photographs = [Photograph(Path("image"), Path("mask"), each, torch.eye(3).double(), SIZE) for each in cameras]
+    cube = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
+    views, left_out = sound_views(photographs, cube)
+    assert [view.photograph for view in views] == [*photographs[:3], photographs[4]]
+    assert left_out == {"nearer than the object is long": 1}
+    views, left_out = sound_views(photographs, 1.3 * cube)  # larger than its frame says, as bad annotations have it
+    assert len(views) == 1 and left_out["with too strong a perspective"] == 3

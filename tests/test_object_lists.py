@@ -1,0 +1,78 @@
+import json
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from lp_framework.data.sets.object_lists import ObjectLists, drawn, kept_lists
+from lp_framework.data.sources import MeshData
+from lp_framework.errors import UserError
+
+NAMES = [f"object_{index}" for index in range(12)]
+
+
+@pytest.mark.parametrize(("seen", "unseen"), [(None, 3), (5, 3), (9, 3), (12, 0), (None, 0)])
+def test_a_drawn_division_is_seeded_disjoint_and_of_the_size_asked(seen, unseen):
+    lists = drawn(NAMES, seen, unseen, 0, Path("here"))
+    assert len(lists.unseen) == unseen and len(lists.seen) == (12 - unseen if seen is None else seen)
+    assert not set(lists.seen) & set(lists.unseen) and {*lists.seen, *lists.unseen} <= set(NAMES)
+    assert lists.seen == sorted(lists.seen) and lists.unseen == sorted(lists.unseen)
+    assert drawn(NAMES[::-1], seen, unseen, 0, Path("here")) == lists
+    if unseen:
+        assert len({tuple(drawn(NAMES, seen, unseen, seed, Path("here")).unseen) for seed in range(5)}) > 2
+
+
+def test_a_division_that_cannot_be():
+    with pytest.raises(UserError, match="here: 12 objects are there, 13 are needed"):
+        drawn(NAMES, 10, 3, 0, Path("here"))
+    with pytest.raises(UserError, match="must not be negative"):
+        drawn(NAMES, None, -1, 0, Path("here"))
+    with pytest.raises(UserError, match=r"data\.objects=unseen: there are none; set data\.unseen"):
+        ObjectLists(NAMES, []).named("unseen")
+
+
+def test_lists_are_written_once_and_read_afterwards(tmp_path):
+    first = kept_lists(tmp_path / "views", {"seed": 0}, lambda: ObjectLists(["a", "b"], ["c"]))
+    assert json.loads((tmp_path / "views" / "objects.json").read_text())["unseen"] == ["c"]
+    assert kept_lists(tmp_path / "views", {"seed": 0}, lambda: ObjectLists(["other"], [])) == first
+    with pytest.raises(UserError, match=r"objects\.json: its objects were chosen otherwise \(seed was 0, is 1\)"):
+        kept_lists(tmp_path / "views", {"seed": 1}, lambda: first)
+    (tmp_path / "views" / "objects.json").write_text("[]")
+    with pytest.raises(UserError, match="is no list of objects"):
+        kept_lists(tmp_path / "views", {"seed": 0}, lambda: first)
+
+
+# ---------------------------------------------------------------- a folder of meshes
+
+
+@pytest.fixture
+def meshes(tmp_path) -> Path:
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for name in NAMES:
+        trimesh.creation.box().export(folder / f"{name}.ply")
+    return folder
+
+
+def names(meshes: Path, **settings) -> list[str]:
+    return MeshData(None, str(meshes), views=str(meshes.parent / "views"), **settings).names()
+
+
+def test_seen_and_unseen_objects_divide_a_folder_of_meshes(meshes):
+    seen, unseen = names(meshes, unseen=4), names(meshes, unseen=4, objects="unseen")
+    assert len(unseen) == 4 and sorted([*seen, *unseen]) == sorted(NAMES)
+    assert names(meshes, unseen=4, seed=7) == seen  # the training seed has no say
+    trimesh.creation.box().export(meshes / "another.ply")
+    assert names(meshes, unseen=4) == seen and names(meshes, unseen=4, objects="unseen") == unseen
+
+
+def test_an_undivided_folder_is_all_seen_and_has_no_list(meshes):
+    assert names(meshes) == sorted(NAMES)
+    assert not (meshes.parent / "views").exists()
+
+
+def test_bad_divisions(meshes):
+    with pytest.raises(UserError, match="12 objects are there, 13 are needed"):
+        names(meshes, unseen=12)
+    with pytest.raises(UserError, match="there are none"):
+        names(meshes, objects="unseen")

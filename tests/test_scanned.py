@@ -1,0 +1,161 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from view_folders import write_object
+
+from lp_framework import registry
+from lp_framework.data.meshes import load_scene, surfaces
+from lp_framework.data.sets.scanned import GSOData, OO3DData, load_gso
+from lp_framework.errors import UserError
+
+# A box of 1 x 2 x 4 whose highest face is painted: u, v of a corner are 0.9 where its z is 4, else 0.1.
+CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 4)]
+FACES = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
+
+
+def obj_text(material: str, order: tuple[int, int, int] = (0, 1, 2)) -> str:
+    """The box as OBJ, its axes in another order."""
+    lines = [f"mtllib {material}", "usemtl material_0"]
+    lines += ["v " + " ".join(str(corner[axis]) for axis in order) for corner in CORNERS]
+    lines += [f"vt {0.9 if z else 0.1} {0.9 if z else 0.1}" for *_, z in CORNERS]
+    lines += ["f " + " ".join(f"{index}/{index}" for index in face.split()) for face in FACES]
+    return "\n".join(lines) + "\n"
+
+
+def texture() -> Image.Image:
+    """Red where u and v are large (v runs upwards), blue elsewhere."""
+    pixels = np.full((8, 8, 3), (0, 0, 255), np.uint8)
+    pixels[:4, 4:] = (255, 0, 0)
+    return Image.fromarray(pixels)
+
+
+def write_gso(root: Path, *names: str) -> Path:
+    """Objects as Google Scanned Objects are released: the material names a texture that lies elsewhere."""
+    for name in names:
+        for folder in ("meshes", "materials/textures", "thumbnails"):
+            (root / name / folder).mkdir(parents=True)
+        (root / name / "model.config").write_text("<model/>")
+        (root / name / "model.sdf").write_text("<sdf/>")
+        (root / name / "meshes" / "model.obj").write_text(obj_text("model.mtl"))
+        (root / name / "meshes" / "model.mtl").write_text("newmtl material_0\nKd 1 1 1\nmap_Kd texture.png\n")
+        texture().save(root / name / "materials" / "textures" / "texture.png")
+    return root
+
+
+def write_oo3d(root: Path, *names: str) -> Path:
+    """Raw scans of OmniObject3D, +Y up: z, x, y of the box are x, y, z of the file in turn."""
+    for name in names:
+        folder = root / name.rpartition("_")[0] / name / "Scan"
+        folder.mkdir(parents=True)
+        (folder / "Scan.obj").write_text(obj_text("Scan.mtl", order=(1, 2, 0)))
+        (folder / "Scan.mtl").write_text("newmtl material_0\nmap_Kd Scan.jpg\n")
+        texture().save(folder / "Scan.jpg", quality=95)
+    return root
+
+
+def check_upright_and_painted(scene) -> None:
+    np.testing.assert_allclose(scene.extents, [0.5, 1.0, 0.25], atol=1e-9)  # y, z, x of the box: 2, 4, 1
+    (surface,) = surfaces(scene)
+    top = surface.positions[:, 1] > 0
+    assert surface.texture is not None and surface.texture_coordinates is not None
+    size = surface.texture.shape[0]
+    for high, (red, _, blue) in ((True, (255, 0, 0)), (False, (0, 0, 255))):
+        u, v = surface.texture_coordinates[top == high].mean(axis=0)
+        colour = surface.texture[int((1 - v) * size), int(u * size)].astype(int)
+        assert abs(colour[0] - red) < 30 and abs(colour[2] - blue) < 30
+    np.testing.assert_allclose(np.cross(*np.diff(surface.positions[:3], axis=0)) @ surface.normals[0] > 0, True)
+
+
+def test_gso_objects_are_turned_upright_and_find_their_texture(tmp_path):
+    write_gso(tmp_path, "Shark")
+    check_upright_and_painted(load_gso(tmp_path / "Shark" / "meshes" / "model.obj"))
+
+
+def test_omniobject3d_scans_are_upright_as_they_are(tmp_path):
+    write_oo3d(tmp_path, "toy_car_003")
+    check_upright_and_painted(load_scene(tmp_path / "toy_car" / "toy_car_003" / "Scan" / "Scan.obj"))
+
+
+# ---------------------------------------------------------------- lists
+
+GSO = [f"Object_{index}" for index in range(9)]
+OO3D = ["apple_001", "apple_002", "toy_car_001", "toy_car_002", "teddy_001"]
+
+
+def gso(root: Path, **settings) -> GSOData:
+    settings = {"views": str(root.parent / "views"), "seen": 5, "unseen": 2, **settings}
+    return GSOData(None, str(root), cache=str(root.parent / "cache"), **settings)
+
+
+def test_a_seeded_choice_is_kept_beside_the_views(tmp_path):
+    root = write_gso(tmp_path / "gso", *GSO)
+    assert registry.get("data", "gso") is GSOData and registry.get("data", "oo3d") is OO3DData
+    seen, unseen = gso(root).names(), gso(root, objects="unseen").names()
+    assert len(seen) == 5 and len(unseen) == 2 and not set(seen) & set(unseen)
+    write_gso(root, "Another", "One_more")
+    assert gso(root).names() == seen and gso(root, objects="unseen").names() == unseen
+    with pytest.raises(UserError, match="split_seed was 0, is 1"):
+        gso(root, split_seed=1).names()
+
+
+def test_the_names_are_those_of_the_renderings_where_they_are_given(tmp_path):
+    root = write_gso(tmp_path / "gso", *GSO)
+    for name in ("Object_3", "Object_7"):
+        write_object(tmp_path / "rendering" / "GSO", name, train=2, test=2)
+    renderings = str(tmp_path / "rendering" / "GSO")
+    assert gso(root, renderings=renderings).names() == ["Object_3", "Object_7"]
+    unseen = gso(root, renderings=renderings, objects="unseen").names()
+    assert len(unseen) == 2 and not set(unseen) & {"Object_3", "Object_7"}
+    write_object(tmp_path / "rendering" / "GSO", "Absent", train=2, test=2)
+    with pytest.raises(UserError, match=r"1 of the 3 objects of .*GSO are missing, such as .*Absent/meshes/model\.obj"):
+        gso(root, renderings=renderings, views=str(tmp_path / "other")).names()
+
+
+def test_categories_with_an_underscore(tmp_path):
+    root = write_oo3d(tmp_path / "raw_scans", *OO3D)
+    data = OO3DData(None, str(root), views=str(tmp_path / "views"), seen=5)
+    assert data.names() == sorted(OO3D)
+    assert all(data.file(name).is_file() for name in OO3D)
+
+
+def test_bad_downloads(tmp_path):
+    root = write_gso(tmp_path / "gso", *GSO)
+    with pytest.raises(UserError, match="nowhere: there is no such folder"):
+        gso(tmp_path / "nowhere").names()
+    with pytest.raises(UserError, match=r"holds no object of GSO; looked for .*OBJECT/meshes/model\.obj"):
+        gso(root / "Object_0").names()
+    with pytest.raises(UserError, match="9 objects are there, 80 are needed"):
+        gso(root, seen=70, unseen=10).names()
+    with pytest.raises(UserError, match=r"looked for .*CATEGORY/CATEGORY_001/Scan/Scan\.obj"):
+        OO3DData(None, str(root), views=str(tmp_path / "views")).names()
+    with pytest.raises(UserError, match="nowhere: there is no such folder"):
+        OO3DData(None, str(tmp_path / "nowhere"), views=str(tmp_path / "views")).names()
+
+
+def test_damaged_objects(tmp_path):
+    root = write_gso(tmp_path, *GSO[:3])
+    (root / GSO[0] / "materials" / "textures" / "texture.png").unlink()
+    (root / GSO[1] / "meshes" / "model.obj").write_text("nothing\n")
+    (root / GSO[2] / "meshes" / "model.obj").unlink()
+    for name, message in zip(GSO, ["texture.png: there is no", "model.obj: ", "model.obj: there is no"], strict=False):
+        with pytest.raises(UserError, match=message):
+            load_gso(root / name / "meshes" / "model.obj")
+
+
+def test_rendering_objects_as_released(tmp_path):
+    from lp_framework.data.rendering.raycast import RaycastRenderer
+
+    root = write_gso(tmp_path / "gso", *GSO[:2])
+    settings = {"resolution": 24, "test_views": 2, "latitude_step_degrees": 60.0, "longitude_step_degrees": 180.0}
+    data = GSOData(
+        RaycastRenderer(), str(root), str(tmp_path / "views"), seen=1, unseen=1, workers=1, image_size=16,
+        cache=str(tmp_path / "cache"), validation_views=0, **settings,
+    )  # fmt: skip
+    data.prepare_data()
+    (name,) = data.names()
+    assert data.table("train").counts == [4] and data.table("test").counts == [2]
+    pixels = np.asarray(Image.open(tmp_path / "views" / name / "train" / "rgb" / "000.png")).astype(int)
+    rows = [pixels[half][pixels[half][..., 3] > 200] for half in (slice(0, 12), slice(12, 24))]
+    assert (rows[0][:, 0] > rows[0][:, 2]).mean() > 0.5 > (rows[1][:, 0] > rows[1][:, 2]).mean()  # red on top
