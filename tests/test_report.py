@@ -139,7 +139,7 @@ def test_experiments_are_tables_of_their_own(tmp_path):
     tables, _ = tables_of(tmp_path)
     assert [table.experiment for table in tables] == ["gamma", "starts", None]
     assert [table.paper and table.paper.name for table in tables] == ["gamma", "starts", None]
-    assert tables[1].columns == ["solver.name", "start.count"]  # the paper's, though nothing varies
+    assert tables[1].columns == ["solver.name", "solver.gamma", "start.count"]  # the paper's, though nothing varies
 
 
 def test_what_the_choice_of_a_solver_says_is_not_a_column():

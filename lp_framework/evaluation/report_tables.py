@@ -14,7 +14,7 @@ from rich.text import Text
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.paper import PaperRow
 from lp_framework.evaluation.runs import COSTS
-from lp_framework.evaluation.sweep_tables import Row, Spread, SweepTable
+from lp_framework.evaluation.sweep_tables import Row, Spread, SweepTable, in_order
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
 
 METRICS = [*COLUMNS, *ERRORS, *COSTS]
@@ -175,7 +175,7 @@ def _down(table: SweepTable) -> Layout:
 def _across(table: SweepTable, axis: str) -> Layout:
     """A line a metric of those that differ in the setting `axis` alone, the values of which are across."""
     others = [key for key in table.columns if key != axis]
-    values = list(dict.fromkeys(row.settings.get(axis) for row in table.rows))
+    values = sorted({row.settings.get(axis) for row in table.rows}, key=in_order)
     labels = [*map(heading, others), "runs", "metric"]
     lines = []
     for settings in _without(table, axis):
