@@ -20,6 +20,7 @@ from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.progress import shown_progress
 from lp_framework.solvers.starts import Starts
 
 
@@ -47,7 +48,8 @@ def estimate_pose(
     index = torch.arange(2, device=device)
     pairs = Pairs(image_batch(prepared).to(device), index[:1], index[1:], ids=index[:1])
     starting = registry.build("start", starts) if isinstance(starts, str) else starts
-    return solver.solve(pairs, starting.make(pairs.ids, seed), seed)
+    with shown_progress():
+        return solver.solve(pairs, starting.make(pairs.ids, seed), seed)
 
 
 def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel | None) -> Solver:

@@ -36,6 +36,7 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.geometry import apply_relative_pose
 from lp_framework.solvers.base import ViewSets
+from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.cameras import cameras_figure
 from lp_framework.viz.style import save_figure
 
@@ -88,7 +89,8 @@ def run(config: DictConfig) -> None:
     views = torch.arange(len(files), device=device)[None]
     view_sets = ViewSets(image_batch(prepared).to(device), views, ids=torch.zeros_like(views[:, 0]))
     ids = view_sets.pairs([0] * (len(files) - 1), range(1, len(files))).ids
-    solution = solver.solve_views(view_sets, starts.make(ids, config.seed)[None], config.seed)
+    with shown_progress():
+        solution = solver.solve_views(view_sets, starts.make(ids, config.seed)[None], config.seed)
 
     names = [f"images/{index:03d}.png" for index in range(len(files))]
     relative = torch.cat([torch.zeros(1, 3, dtype=torch.float64), solution.poses[0].detach().cpu().double()])

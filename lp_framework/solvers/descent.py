@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.geometry import wrap_angle
+from lp_framework.solvers.progress import steps_of
 
 
 class GradientDescent:
@@ -95,7 +96,7 @@ def descend(
     total = torch.zeros_like(optimizer.rate)
     sound, place = parameters, pose_of(parameters)  # the last of each start where energy and gradient were finite
     path = []
-    for step in range(steps):
+    for step in steps_of(steps, "descending the prior"):
         variable = parameters.detach().clone().requires_grad_()
         with torch.enable_grad():
             pose = pose_of(variable)

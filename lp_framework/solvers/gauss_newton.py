@@ -18,6 +18,7 @@ from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
+from lp_framework.solvers.progress import steps_of
 from lp_framework.solvers.twist import TanhRadius
 
 LONGEST_STEP = 0.5  # radians and scene units; the prior is not to be left where it hardly depends on the pose
@@ -88,7 +89,7 @@ class GaussNewton(Solver):
         damping = self.damping * here.hessian.diagonal(dim1=-2, dim2=-1).amax(dim=-1)  # [B, N]
         growth = torch.full_like(damping, 2.0)
         identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
-        for _ in range(self.steps):
+        for _ in steps_of(self.steps, "descending the prior"):
             damped = here.hessian + damping[..., None, None] * identity
             solved, _ = torch.linalg.solve_ex(damped, here.gradient)
             length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)

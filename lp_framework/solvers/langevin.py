@@ -16,6 +16,7 @@ from lp_framework.keyed_random import keyed_normal
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, as_triple, check_starts, choose
+from lp_framework.solvers.progress import steps_of
 
 
 @register("solver", "langevin")
@@ -50,7 +51,7 @@ class Langevin(Solver):
         condition = self.model.condition(features[pairs.reference], features[pairs.query])[:, None]  # [B, 1, hidden]
         pose, path = starts, [starts]
         noise = self._noise(pairs, starts.shape[1], seed).to(starts)
-        for step in range(self.iterations):
+        for step in steps_of(self.iterations, "first stage"):
             pose = pose + self.alpha * self.model.field(condition, pose).score + noise[:, :, step]
             if self.trajectory:
                 path.append(pose)

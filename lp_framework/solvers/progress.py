@@ -1,0 +1,34 @@
+"""A bar for a solver's steps, where somebody waits for one solution; an evaluation has a bar of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+_bars: ContextVar[Progress | None] = ContextVar("bars", default=None)
+
+
+@contextmanager
+def shown_progress() -> Iterator[None]:
+    """Solvers that run inside show their steps on the terminal, if there is one; the bars go when they are done."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bars:
+        token = _bars.set(bars)
+        try:
+            yield
+        finally:
+            _bars.reset(token)
+
+
+def steps_of(count: int, description: str) -> Iterable[int]:
+    """0 to `count` - 1, with a bar inside `shown_progress`."""
+    bars = _bars.get()
+    return range(count) if bars is None else bars.track(range(count), description=description)
