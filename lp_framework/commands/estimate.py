@@ -114,6 +114,17 @@ def run(config: DictConfig) -> None:
     }
     _write(folder, estimated, prepared, result)
     _print(folder, estimated)
+    if knows_little(config):
+        log.warning(
+            "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing. "
+            "For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER"
+        )
+
+
+def knows_little(config: DictConfig) -> bool:
+    """Whether the answer rests on the prior that ships."""
+    asked = registry.component_names(registry.get("solver", config.solver.name))
+    return "prior" in asked and config.prior.name == "tiny" and config.prior.path is None
 
 
 def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
