@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from PIL import Image
-from torch import Tensor, nn
+from torch import Tensor
 
 import lp_framework
 from lp_framework import registry
@@ -44,7 +44,7 @@ def estimate_pose(
     if isinstance(solver, str):
         solver = _build_solver(solver, prior, model)
         move(solver, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
-    device = next((each.device for part in networks(solver) for each in part.parameters()), torch.device("cpu"))
+    device = next((each.device for part in solver.networks() for each in part.parameters()), torch.device("cpu"))
     index = torch.arange(2, device=device)
     pairs = Pairs(image_batch(prepared).to(device), index[:1], index[1:], ids=index[:1])
     starting = registry.build("start", starts) if isinstance(starts, str) else starts
@@ -84,12 +84,7 @@ def image_batch(prepared: Sequence[Image.Image]) -> Tensor:
     return as_images(np.stack([on_white(image) for image in prepared]))
 
 
-def networks(solver: Solver) -> list[nn.Module]:
-    """The networks that a solver was given."""
-    return [part for part in vars(solver).values() if isinstance(part, nn.Module)]
-
-
 def move(solver: Solver, device: torch.device) -> None:
     """Move a solver's networks to a device."""
-    for part in networks(solver):
+    for part in solver.networks():
         part.to(device)

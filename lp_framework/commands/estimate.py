@@ -31,6 +31,7 @@ from lp_framework.data.photographs import (
     photograph_files,
     prepare,
     read_image,
+    save_png,
 )
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
@@ -161,7 +162,7 @@ def _in_degrees(pose: Tensor) -> tuple[float, float, float]:
 def _write(folder: Path, views: Sequence[View], prepared: Sequence[Image.Image], result: dict[str, Any]) -> None:
     (folder / "images").mkdir(exist_ok=True)
     for view, image in zip(views, prepared, strict=True):
-        image.save(folder / view.image)
+        save_png(folder / view.image, image)
     numbers = [number for number, view in enumerate(views) if view.valid]
     poses = torch.stack([views[number].absolute for number in numbers])
     files = [views[number].image for number in numbers]

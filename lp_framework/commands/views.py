@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from lp_framework.api import image_batch
 from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.cache import tracked
-from lp_framework.data.photographs import BackgroundRemover, mask_files, on_white, prepare, read_image
+from lp_framework.data.photographs import BackgroundRemover, mask_files, on_white, prepare, read_image, save_png
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
@@ -147,13 +146,6 @@ def file_name(latitude: float, longitude: float) -> str:
     'latitude-20_longitude030.png'
     """
     return f"latitude{latitude:+g}_longitude{longitude:03g}.png"
-
-
-def save_png(path: Path, image: Image.Image) -> None:
-    """Write an image whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    image.save(partial, "PNG")
-    os.replace(partial, path)
 
 
 def records(latitudes: Sequence[float], longitudes: Sequence[float], poses: Tensor) -> list[dict[str, object]]:

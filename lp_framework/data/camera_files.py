@@ -9,13 +9,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lp_framework.geometry import camera_to_world, inverse, to_ifusion
-
-_OPENGL_TO_COLMAP = (1.0, -1.0, -1.0, 1.0)  # of camera axes: COLMAP's y points down and its z forward
+from lp_framework.geometry import camera_to_world, from_opencv, inverse, to_ifusion
 
 
 def nerf_transforms(files: Sequence[str], poses: Tensor, field_of_view_degrees: float) -> dict[str, Any]:
@@ -39,7 +36,9 @@ def colmap_model(files: Sequence[str], poses: Tensor, size: int, field_of_view_d
     right, y down, z forward), and no points. The world is ours, with +Y up.
     """
     focal = size / 2 / math.tan(math.radians(field_of_view_degrees) / 2)  # pixels
-    matrices = inverse(camera_to_world(poses.double()) * torch.tensor(_OPENGL_TO_COLMAP, dtype=torch.float64))
+    matrices = inverse(
+        from_opencv(camera_to_world(poses.double()))
+    )  # COLMAP has OpenCV's axes; the change is its own inverse
     quaternions = Rotation.from_matrix(matrices[:, :3, :3].numpy()).as_quat(canonical=True)  # scalar last
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for number, (file, (x, y, z, w), matrix) in enumerate(zip(files, quaternions, matrices, strict=True), start=1):

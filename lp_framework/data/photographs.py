@@ -15,6 +15,7 @@ same share: it is about 0 where the object looks as large from both, negative wh
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -246,3 +247,10 @@ def on_white(image: Image.Image) -> NDArray[np.uint8]:
     white = Image.new("RGBA", image.size, "white")
     white.alpha_composite(image)
     return np.asarray(white.convert("RGB"))
+
+
+def save_png(path: Path, image: Image.Image) -> None:
+    """Write an image whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    image.save(partial, "PNG")
+    os.replace(partial, path)

@@ -21,7 +21,7 @@ import math
 import torch
 from torch import Tensor
 
-from lp_framework.geometry import camera_to_world, geodesic_angle, inverse, rigid_transform, view_pose
+from lp_framework.geometry import camera_to_world, from_opencv, geodesic_angle, inverse, rigid_transform, view_pose
 
 FIELD_OF_VIEW_DEGREES = 49.1  # of the priors, and of rendered views
 NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
@@ -30,14 +30,14 @@ NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is
 # ---------------------------------------------------------------- other conventions
 
 
-def from_opencv(world_to_camera: Tensor) -> Tensor:
+def from_opencv_view(world_to_camera: Tensor) -> Tensor:
     """Camera to world `[..., 4, 4]` with OpenGL axes of a world-to-camera matrix with OpenCV's (x right, y down, z
     forward), as COLMAP and BOP have them.
 
-    >>> from_opencv(rigid_transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0])))[:3, 3]  # the origin is 2 ahead
+    >>> from_opencv_view(rigid_transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0])))[:3, 3]  # the origin is 2 ahead
     tensor([-0., -0., -2.])
     """
-    return inverse(world_to_camera) * world_to_camera.new_tensor([1.0, -1.0, -1.0, 1.0])
+    return from_opencv(inverse(world_to_camera))
 
 
 def from_pytorch3d(rotation: Tensor, translation: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ class Evaluation(LightningModule):
         super().__init__()
         self.solver, self.starts, self.seed = solver, starts, seed
         # Registered, so that Lightning moves the networks of the solver to the device.
-        self.networks = torch.nn.ModuleList(part for part in vars(solver).values() if isinstance(part, torch.nn.Module))
+        self.networks = torch.nn.ModuleList(solver.networks())
         self.solved, self.seconds, self.passes = SumMetric(), SumMetric(), SumMetric()
 
     def setup(self, stage: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lp_framework.errors import UserError
 from lp_framework.keyed_random import keyed_bits
@@ -145,6 +145,10 @@ def as_triple(name: str, value: float | Sequence[float]) -> list[float]:
 
 class Solver(ABC):
     """Estimates relative poses. A subclass's constructor declares what it needs by name: `model`, `prior`."""
+
+    def networks(self) -> list[nn.Module]:
+        """The networks that it was given, to be moved to a device."""
+        return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     @abstractmethod
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:

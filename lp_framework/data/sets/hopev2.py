@@ -23,7 +23,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from lp_framework.data.real_cameras import from_opencv, normalised, z_up_to_y_up
+from lp_framework.data.real_cameras import from_opencv_view, normalised, z_up_to_y_up
 from lp_framework.data.sets.converted import ConvertedData, Photograph
 from lp_framework.errors import UserError
 from lp_framework.geometry import rigid_transform
@@ -111,7 +111,7 @@ class HOPEv2Data(ConvertedData):
         skew = (rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max()
         if not (skew < 1e-3 and rotation.det() > 0):
             raise UserError(f"{annotation}: cam_R_m2c of image {image} is not a rotation")
-        camera = from_opencv(rigid_transform(rotation, translation))
+        camera = from_opencv_view(rigid_transform(rotation, translation))
         if not (rotation @ box.centre + translation)[2] > 0:
             raise UserError(f"{annotation}: image {image} has an object behind its camera (cam_t_m2c)")
         intrinsics = _numbers(
