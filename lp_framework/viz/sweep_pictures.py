@@ -19,7 +19,8 @@ AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of thei
 RECALL, SUCCESS = ([f"{prefix}@{degrees}" for degrees in ROTATION_THRESHOLDS] for prefix in ("R", "SR"))
 PANELS = {"Recall R (chosen start)": RECALL, "Success rate SR (all starts)": SUCCESS}
 NOISE = "noise scale \u03b3 of the longitude"
-SECONDS = "seconds_per_pair"
+SECONDS, SOLVER = "seconds_per_pair", "solver.name"
+ROTATION_RECALL = [f"R(R)@{degrees}" for degrees in ROTATION_THRESHOLDS]
 
 
 def sweep_figure(table: SweepTable) -> Figure | None:
@@ -41,6 +42,34 @@ def sweep_figure(table: SweepTable) -> Figure | None:
         rest = [each for each in rest if each not in beside]
     entries += [Entry(f"paper: {each.label}", each.metrics, {}, paper=True) for each in rest]
     return entries_figure(entries, PANELS, paper)
+
+
+def cost_figure(table: SweepTable) -> Figure | None:
+    """Rotation recall of each solver against its seconds a pair; None where there is one solver, or where the table's
+    own figure has the time.
+    """
+    groups: dict[str, list[Row]] = {}
+    for row in table.rows:
+        groups.setdefault(str(row.settings.get(SOLVER)), []).append(row)
+    if not 1 < len(groups) <= len(COLOURS) or _is_swept(table, "start.count"):
+        return None
+    panels = []
+    for name in ROTATION_RECALL:
+        curves = []
+        for solver, rows in groups.items():
+            rows = sorted(rows, key=lambda row: row.metrics[SECONDS].mean)
+            stds = [row.metrics[name].std for row in rows]
+            curves.append(
+                Curve(
+                    solver,
+                    np.array([row.metrics[SECONDS].mean for row in rows]),
+                    np.array([row.metrics[name].mean for row in rows]),
+                    np.array([math.nan if std is None else std for std in stds]),
+                    words=[label(_others(row, SOLVER)) for row in rows],
+                )
+            )
+        panels.append(Panel(name, "seconds a pair (log scale)", curves, logarithmic=True))
+    return curves_figure(panels, "")
 
 
 def label(settings: Mapping[str, Any]) -> str:
