@@ -23,7 +23,7 @@ def test_a_mark_a_solver_at_its_seconds_and_recall(tmp_path):
     figure = cost_figure(table_of(tmp_path))
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["R(R)@5", "R(R)@15", "R(R)@30"]
     for axes, factor in zip(figure.axes, (0.7, 0.95, 1.0), strict=True):
-        marks = sorted((line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines if len(line.get_xdata()) == 1)
+        marks = sorted(bars.lines[0].get_xydata()[0].tolist() for bars in axes.containers)
         expected = [(0.02, 0.1), (5.0, 0.9), (20.0, 0.6)]
         for (seconds, recall), (true_seconds, true_recall) in zip(marks, expected, strict=True):
             assert (seconds, recall) == pytest.approx((true_seconds, true_recall * factor + 0.01))
