@@ -379,6 +379,42 @@ def test_what_else_lies_among_the_views_is_not_part_of_the_data_set(mesh_data, m
     assert RenderingsData(str(tmp_path / "rendered")).names() == ["brick", "cube", "cup"]
 
 
+def labels_of(data: MeshData, split: str = "test") -> dict[str, tuple[str, bool | None]]:
+    table = data.table(split)
+    return dict(zip(table.names, zip(table.ambiguities, table.unique_answer, strict=True), strict=True))
+
+
+def test_labels_of_a_file_hold_for_views_that_are_there_already_and_change_nothing_on_disk(mesh_data, tmp_path):
+    mesh_data().prepare_data()
+    before = {path: path.read_bytes() for path in (tmp_path / "rendered").rglob("*.*") if path.is_file()}
+    file = tmp_path / "labels.yaml"
+    file.write_text("brick: {ambiguity: twofold, reason: two ends alike}\ncube: {ambiguity: unique}\n")
+    data = mesh_data(Grey(), labels=str(file))
+    data.prepare_data()
+    assert labels_of(data) == labels_of(data, "train") == {"brick": ("twofold", True), "cube": ("unique", True)}
+    file.write_text("brick: {ambiguity: continuous}\ncube: {ambiguity: continuous, unique_answer: true}\n")
+    data = mesh_data(labels=str(file))
+    data.render()
+    assert labels_of(data) == {"brick": ("continuous", False), "cube": ("continuous", True)}
+    assert labels_of(mesh_data()) == {"brick": ("unlabelled", None), "cube": ("unlabelled", None)}
+    assert {path: path.read_bytes() for path in (tmp_path / "rendered").rglob("*.*") if path.is_file()} == before
+
+
+def test_labels_are_rendered_into_new_views(mesh_data, tmp_path):
+    file = tmp_path / "labels.yaml"
+    file.write_text("{brick: {ambiguity: twofold}, cube: {ambiguity: continuous}}")
+    mesh_data(labels=str(file)).prepare_data()
+    expected = {"brick": ("twofold", True), "cube": ("continuous", False)}
+    assert labels_of(mesh_data()) == labels_of(RenderingsData(str(tmp_path / "rendered"), str(tmp_path))) == expected
+
+
+def test_one_file_of_labels_serves_seen_and_unseen_objects(mesh_data, tmp_path):
+    file = tmp_path / "labels.yaml"
+    file.write_text("{brick: {ambiguity: twofold}, cube: {ambiguity: continuous}}")
+    halves = [mesh_data(labels=str(file), unseen=1, objects=which).objects() for which in ("seen", "unseen")]
+    assert {obj.name: obj.ambiguity for half in halves for obj in half} == {"brick": "twofold", "cube": "continuous"}
+
+
 def test_files_that_are_no_meshes_are_passed_over(mesh_data, meshes):
     (meshes / "readme.txt").write_text("two boxes")
     (meshes / "._cube.ply").write_text("what some systems leave behind")

@@ -16,6 +16,7 @@ from lp_framework.geometry import (
     geodesic_angle,
     hat,
     inverse,
+    is_rotation,
     rigid_transform,
     se3_exp,
     se3_log,
@@ -256,6 +257,16 @@ def test_geodesic_angle_is_differentiable_and_finite_at_its_kink() -> None:
     assert torch.autograd.gradcheck(geodesic_angle, (first, second), check_forward_ad=True)
     (gradient,) = torch.autograd.grad(geodesic_angle(first, first.detach()), first)
     assert torch.equal(gradient, torch.zeros_like(gradient))
+
+
+@given(twists)
+@law
+def test_rotations_are_known_and_what_is_none(xi: Tensor) -> None:
+    rotation = so3_exp(xi[3:])
+    scaled, mirrored, sheared = 1.01 * rotation, -rotation, rotation + 0.01 * torch.eye(3, dtype=torch.float64)[0]
+    found = is_rotation(torch.stack([rotation, scaled, mirrored, sheared, torch.full((3, 3), math.nan).double()]))
+    assert found.tolist() == [True, False, False, False, False]
+    assert is_rotation(rotation.float()) and not is_rotation(rotation + math.inf) and not is_rotation(1e300 * rotation)
 
 
 # iFusion

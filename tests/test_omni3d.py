@@ -107,6 +107,10 @@ def of_another_shape(root: Path) -> None:
     np.save(broken(root)[0], np.eye(3))
 
 
+def of_complex_numbers(root: Path) -> None:
+    np.save(broken(root)[0], np.load(broken(root)[0]) + 0j)
+
+
 def scaled(root: Path) -> None:
     np.save(broken(root)[0], 2 * np.load(broken(root)[0]))
 
@@ -132,6 +136,7 @@ def alone(root: Path) -> None:
         (oblong, r"images/001\.png: is 20 x 30 pixels; views must be square"),
         (cut_short, r"poses/001\.npy: is not a readable array"),
         (of_another_shape, r"poses/001\.npy: must be a 4 x 4 camera-to-world matrix .* got \[3, 3\]"),
+        (of_complex_numbers, r"poses/001\.npy: is not a readable array"),
         (scaled, r"poses/001\.npy: is not a rigid camera-to-world transform"),
         (y_up, r"poses/001\.npy: its camera does not look at the origin with \+Z up"),
         (at_the_centre, r"poses/001\.npy: its camera must stand off the origin"),
@@ -145,6 +150,23 @@ def test_bad_input(data, root, tmp_path, damage, message):
         data.prepare_data()
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "views").glob("*dinosaur*"))
+
+
+def test_an_object_that_cannot_be_converted_does_not_stop_the_others(data, root, tmp_path):
+    write_omni3d(root, "boat_001")
+    opaque(root)
+    data.evaluate_on("ordered", 0)
+    with pytest.raises(UserError, match=r"1 of 2 objects could not be converted: dinosaur_002: .*transparent"):
+        data.prepare_data()
+    assert [folder.name for folder in (tmp_path / "views").iterdir() if folder.is_dir()] == ["boat_001"]
+
+
+def test_there_is_nothing_to_train_on(data):
+    with pytest.raises(UserError, match="data=omni3d has test views only, so there is nothing to train on; evaluate"):
+        data.prepare_data()
+    data.evaluate_on("ifusion", 0)  # takes training views, too
+    with pytest.raises(UserError, match="has test views only"):
+        data.prepare_data()
 
 
 def test_wrong_roots(root, tmp_path):

@@ -12,13 +12,17 @@ from lp_framework.evaluation.report_tables import METRICS
 
 SOURCE = Path(__file__).parents[1].parent / "shared" / "paper" / "landscape_awareness.tex"
 LABELS = {
+    "co3d": "tab:eval_results_CO3Dv2",
     "gamma": "tab:noise_scale",
+    "hopev2": "tab:eval_results_HOPEv2",
     "methods": "tab:eval_results_myGSO_myOO3D",
     "priors": "tab:ablation_model",
     "score_energy": "tab:2methods_performance",
     "stages": "tab:multi_view",
     "starts": "tab:inference_time",
+    "unseen": "tab:eval_results_unseen",
 }
+WITHOUT_NUMBERS = {"tab:symbols"}
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +50,12 @@ def latex_rows(table: str) -> list[list[float | None]]:
 
 
 def in_plain_words(text: str) -> list[str]:
-    text = text.replace(r"$\gamma$", "gamma").replace(r"^\circ$", " degrees").replace(r"\&", "and")
+    text = (
+        re.sub(r"\\hspace\{\w+\}", " ", text)
+        .replace(r"$\gamma$", "gamma")
+        .replace(r"^\circ$", " degrees")
+        .replace(r"\&", "and")
+    )
     return re.findall(r"\w+", re.sub(r"\\\w+(\{\w+\}\{)?|[{}$]", " ", text))
 
 
@@ -58,10 +67,14 @@ def values(name: str) -> list[list[float | None]]:
 
 def test_every_table_is_checked():
     assert {table.name for table in paper_tables()} == set(LABELS)
-    assert all(table.name == table.experiment for table in paper_tables())
+    assert all(table.name == table.experiments[0] for table in paper_tables())
 
 
-@pytest.mark.parametrize("name", ["methods", "priors", "score_energy"])
+def test_every_table_of_the_paper_is_here(source):
+    assert set(re.findall(r"\\label\{(tab:\w+)\}", source)) == {*LABELS.values(), *WITHOUT_NUMBERS}
+
+
+@pytest.mark.parametrize("name", ["co3d", "hopev2", "methods", "priors", "score_energy", "unseen"])
 def test_a_table_with_a_row_a_line_is_the_papers(source, name):
     assert values(name) == latex_rows(latex_table(source, LABELS[name]))
 
@@ -118,9 +131,36 @@ def test_the_main_table_has_the_recalls_of_gamma_03_and_the_success_rates_of_no_
     assert nearest == 0.1
 
 
+@pytest.mark.parametrize(
+    ("name", "labels", "pairs"),
+    [
+        ("methods", ("GSO, iFusion", "GSO, Ours", "OO3D, iFusion", "OO3D, Ours"), 70 * 8),
+        ("gamma", ("gamma 0", "gamma 0.1", "gamma 0.3", "gamma 0.5"), 70 * 8),
+        ("score_energy", ("Score", "Energy"), 10 * 8),
+        ("hopev2", ("iFusion", "Ours"), 28 * 6),
+        ("unseen", ("Ours",), 11 * 8),
+        ("co3d", ("iFusion", "Ours"), 29 * 8),
+        ("stages", ("w/o Stage 1, 2", "w/o Stage 2, 2", "Stage 1 & 2, 2"), 100 * 1),
+        ("stages", ("w/o Stage 1, 3", "w/o Stage 2, 3", "Stage 1 & 2, 3"), 100 * 3),
+        ("stages", ("w/o Stage 1, 4", "w/o Stage 2, 4", "Stage 1 & 2, 4"), 100 * 6),
+        ("stages", ("w/o Stage 1, 8", "w/o Stage 2, 8", "Stage 1 & 2, 8"), 10 * 28),
+    ],
+)
+def test_recalls_are_shares_of_as_many_pairs_as_the_notes_say(name, labels, pairs):
+    """Each is a whole number over `pairs`, to the three digits printed; of 0.0625, either neighbour may be printed."""
+    shares = {count / pairs for count in range(pairs + 1)}
+    rows = [row for row in paper_table(name).rows if row.label in labels]
+    assert len(rows) == len(labels)
+    recalls = [value for row in rows for key, value in row.metrics.items() if key.startswith("R")]
+    assert recalls and all(min(abs(share - value) for share in shares) < 5.001e-4 for value in recalls)
+
+
 def test_a_run_is_compared_with_the_rows_whose_settings_it_has():
     table = paper_table("methods")
     matching = table.matching({"solver.name": "ifusion", "data.name": "toy"})
     assert [row.label for row in matching] == ["GSO, iFusion", "OO3D, iFusion"]
+    on_oo3d = table.matching({"solver.name": "ifusion", "data.name": "oo3d"})
+    assert [row.label for row in on_oo3d] == ["OO3D, iFusion"]
+    assert paper_table("main") is table
     assert table.matching({"solver.name": "langevin"}) == [] == table.matching({})
     assert paper_table("nothing") is None and paper_table(None) is None

@@ -438,14 +438,16 @@ def test_a_folder_without_its_record_is_not_believed(tmp_path, damage):
         render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
 
 
-def test_other_labels_or_another_protocol_are_noticed_without_the_meshes(tmp_path):
+def test_another_protocol_is_noticed_without_the_meshes_and_other_labels_render_nothing_anew(tmp_path):
     (cube,) = objects_named("cube")
     render_objects([cube], tmp_path, SMALL, FlatRenderer(), workers=1)
-    relabelled, other = replace(cube, ambiguity="twofold"), replace(SMALL, seed=1)
-    with pytest.raises(UserError, match=r"rendered differently \(ambiguity was unique, is twofold\)"):
-        render_objects([relabelled], tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
+    before = contents(tmp_path / "cube")
     with pytest.raises(UserError, match=r"rendered differently \(seed was 0, is 1\)"):
-        render_objects([cube], tmp_path, other, FlatRenderer(), workers=1, check_meshes=False)
+        render_objects([cube], tmp_path, replace(SMALL, seed=1), FlatRenderer(), workers=1, check_meshes=False)
+    for check_meshes in (False, True):
+        relabelled = [replace(cube, ambiguity="twofold")]
+        render_objects(relabelled, tmp_path, SMALL, FlatRenderer(fails_at=0), workers=1, check_meshes=check_meshes)
+    assert contents(tmp_path / "cube") == before
 
 
 def test_a_failed_run_gives_its_lock_back_while_its_error_is_still_looked_at(tmp_path):

@@ -79,13 +79,11 @@ def load_scene(path: str | Path) -> trimesh.Scene:
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
     try:
-        loaded = trimesh.load_scene(str(path))
-    except Exception as error:  # the parsers of trimesh raise anything from KeyError to struct.error
-        raise UserError(f"{path}: does not load as a mesh ({type(error).__name__}: {error})") from error
-    try:
-        scene = normalise(loaded)
+        scene = normalise(trimesh.load_scene(str(path)))
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+    except Exception as error:  # the parsers of trimesh raise anything from KeyError to struct.error
+        raise UserError(f"{path}: does not load as a mesh ({type(error).__name__}: {error})") from error
     plain = sum(not _has_colour(mesh) for mesh in scene.geometry.values())
     if plain:
         warnings.warn(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal
 
@@ -12,8 +13,10 @@ from lp_framework.data.meshes import MeshObject, load_scene
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
+from lp_framework.data.sets.object_labels import Label, read_labels
 from lp_framework.data.sets.object_lists import drawn, kept_lists
 from lp_framework.data.toy import toy_objects
+from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -41,6 +44,16 @@ class RenderedData(PairDataModule):
     def render(self) -> None:
         """Render the objects that are not there yet; the meshes of the others must be those they were made from."""
         render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers)
+
+    def _on_disk(self, split: str) -> list[ObjectViews]:
+        """The views, with the labels of the objects where these have any, whatever the views were rendered with."""
+        labelled = {obj.name: obj for obj in self.objects() if obj.ambiguity != "unlabelled"}
+        return [
+            replace(views, ambiguity=obj.ambiguity, unique_answer=obj.unique_answer)
+            if (obj := labelled.get(views.name))
+            else views
+            for views in super()._on_disk(split)
+        ]
 
 
 @register("data", "toy")
@@ -81,7 +94,8 @@ class ToyData(RenderedData):
 class MeshData(RenderedData):
     """A folder of meshes, in any formats that trimesh reads; rendered into `views`.
 
-    `unseen` of its objects are kept from training; `objects` says whether these or the others are in use.
+    `unseen` of its objects are kept from training; `objects` says whether these or the others are in use. `labels` is
+    a YAML file with their ambiguity classes (see `object_labels`).
     """
 
     def __init__(
@@ -89,6 +103,7 @@ class MeshData(RenderedData):
         renderer: Renderer,
         path: str,
         views: str | None = None,
+        labels: str | None = None,
         unseen: int = 0,
         objects: Literal["seen", "unseen"] = "seen",
         split_seed: int = 0,
@@ -104,7 +119,7 @@ class MeshData(RenderedData):
         validation_views: int = 8,
         seed: int = 0,
     ) -> None:
-        self.meshes = Path(path)
+        self.meshes, self.labels = Path(path), None if labels is None else Path(labels)
         folder = views if views is not None else f"datasets/{self.meshes.resolve().name}"
         super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
         self.unseen, self.which, self.split_seed = unseen, objects, split_seed
@@ -118,12 +133,7 @@ class MeshData(RenderedData):
 
     def objects(self) -> list[MeshObject]:
         """One object a mesh file, named after it, sorted by name; of a divided folder the seen or the unseen ones."""
-        if not self.meshes.is_dir():
-            raise UserError(f"{self.meshes}: there is no such folder of meshes; give data.path=FOLDER")
-        formats = {f".{suffix}" for suffix in trimesh.available_formats()}
-        files = sorted(file for file in self.meshes.iterdir() if file.suffix.lower() in formats and file.name[0] != ".")
-        if not files:
-            raise UserError(f"{self.meshes}: holds no mesh file (known formats: {', '.join(sorted(formats))})")
+        files = self._files
         if self.unseen or self.which == "unseen":
             names = [file.stem for file in files]
             lists = kept_lists(
@@ -132,7 +142,25 @@ class MeshData(RenderedData):
                 lambda: drawn(names, None, self.unseen, self.split_seed, self.meshes),
             )
             files = [file for file in files if file.stem in lists.named(self.which)]
-        return [MeshObject(file.stem, "unlabelled", partial(load_scene, file)) for file in files]
+        return [self._object(file) for file in files]
+
+    def _object(self, file: Path) -> MeshObject:
+        label = self._labels.get(file.stem, Label("unlabelled"))
+        return MeshObject(file.stem, label.ambiguity, partial(load_scene, file), label.unique_answer)
+
+    @cached_property
+    def _files(self) -> list[Path]:
+        if not self.meshes.is_dir():
+            raise UserError(f"{self.meshes}: there is no such folder of meshes; give data.path=FOLDER")
+        formats = {f".{suffix}" for suffix in trimesh.available_formats()}
+        files = sorted(file for file in self.meshes.iterdir() if file.suffix.lower() in formats and file.name[0] != ".")
+        if not files:
+            raise UserError(f"{self.meshes}: holds no mesh file (known formats: {', '.join(sorted(formats))})")
+        return files
+
+    @cached_property
+    def _labels(self) -> dict[str, Label]:
+        return {} if self.labels is None else read_labels(self.labels, {file.stem for file in self._files}, self.meshes)
 
 
 @register("data", "renderings")

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.errors import UserError
-from lp_framework.geometry import spherical_residual, view_pose
+from lp_framework.geometry import is_rotation, spherical_residual, view_pose
 
 AMBIGUITIES = ("unique", "twofold", "continuous", "unlabelled")
 TRANSFORMS = "transform.json"
@@ -116,11 +116,8 @@ def _camera(path: Path, index: int, matrix: Any) -> Tensor:
         camera = torch.empty(0)
     if camera.shape != (4, 4) or not camera.isfinite().all():
         raise UserError(f"{path}: transform_matrix of frame {index} is not a 4 x 4 matrix of finite numbers")
-    rotation, identity = camera[:3, :3], torch.eye(4, dtype=torch.float64)
-    skew = (rotation.mT @ rotation - identity[:3, :3]).abs().max()
-    last_row = (camera[3] - identity[3]).abs().max()
-    # These comparisons refuse NaN as well, which huge numbers lead to.
-    if not (skew < 1e-3 and last_row < 1e-3 and rotation.det() > 0):
+    last_row = (camera[3] - camera.new_tensor([0, 0, 0, 1])).abs().max()
+    if not (is_rotation(camera[:3, :3]) and last_row < 1e-3):
         raise UserError(f"{path}: transform_matrix of frame {index} is not a rigid camera-to-world transform")
     distance = camera[:3, 3].norm().item()
     if not 1e-6 < distance < math.inf:

@@ -70,7 +70,7 @@ def _pairs(file: Path, objects: Sequence[str]) -> list[tuple[str, str, str, Tens
             for view, entry in content["obs"].items()
             if str(view) != anchor
         }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise UserError(
             f"{file}: needs anchor_vid, and obs with rel_sph for each other view ({type(error).__name__}: {error})"
         ) from error

@@ -1,9 +1,9 @@
 """The paper's own numbers, as data: `paper/*.yaml`, a file a table.
 
-A file holds the table's `title`, the `experiment` of this project that repeats it, its `source` and `caption`, `notes`
+A file holds the table's `title`, the `experiments` of this project that repeat it, its `source` and `caption`, `notes`
 on what differs, the dotted `settings` in which its rows differ, the `columns` of its values (named as in
-`results.json`), and `rows`: a `label`, the `settings` that the run to compare with has, and the `values`, null where
-the paper has none.
+`results.json`), and `rows`: a `label`, the `settings` that the run to compare with has, the `data` set in tables of
+several, and the `values`, null where the paper has none.
 """
 
 from __future__ import annotations
@@ -21,10 +21,14 @@ PAPER = "Landscape-Awareness for Geometric View Diffusion Model"
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of a table: its label in the paper, the settings of the run to compare with, and what the paper has."""
+    """A row of a table: its label in the paper, the settings of the run to compare with, and what the paper has.
+
+    `data` is the row's data set by its name here, None in a table of one.
+    """
 
     label: str
     settings: Mapping[str, Any]
+    data: str | None
     metrics: Mapping[str, float]
 
 
@@ -34,7 +38,7 @@ class PaperTable:
 
     name: str
     title: str
-    experiment: str
+    experiments: Sequence[str]
     source: str
     caption: str
     notes: Sequence[str]
@@ -43,10 +47,14 @@ class PaperTable:
     rows: Sequence[PaperRow]
 
     def matching(self, settings: Mapping[str, Any]) -> list[PaperRow]:
-        """The rows to put beside a run with these settings: all that they name is set so in the run."""
-        return [
+        """The rows to put beside a run with these settings: all that they name is set so in the run.
+
+        A run on a data set of the table is compared with that one's rows alone.
+        """
+        rows = [
             row for row in self.rows if all(settings.get(key, _NOWHERE) == value for key, value in row.settings.items())
         ]
+        return [row for row in rows if row.data is not None and row.data == settings.get("data.name")] or rows
 
 
 _NOWHERE = object()
@@ -54,7 +62,7 @@ _NOWHERE = object()
 
 def paper_table(experiment: str | None) -> PaperTable | None:
     """The table that an experiment repeats, if the paper has one."""
-    return next((table for table in paper_tables() if table.experiment == experiment), None)
+    return next((table for table in paper_tables() if experiment in table.experiments), None)
 
 
 @cache
@@ -70,10 +78,19 @@ def _read(name: str, content: Mapping[str, Any]) -> PaperTable:
         PaperRow(
             row["label"],
             row["settings"],
+            row.get("data"),
             {key: value for key, value in zip(columns, row["values"], strict=True) if value is not None},
         )
         for row in content["rows"]
     ]
-    texts = {key: " ".join(content[key].split()) for key in ("title", "experiment", "source", "caption")}
+    texts = {key: " ".join(content[key].split()) for key in ("title", "source", "caption")}
     notes = [" ".join(note.split()) for note in content["notes"]]
-    return PaperTable(name=name, **texts, notes=notes, settings=content["settings"], columns=columns, rows=rows)
+    return PaperTable(
+        name=name,
+        **texts,
+        experiments=content["experiments"],
+        notes=notes,
+        settings=content["settings"],
+        columns=columns,
+        rows=rows,
+    )

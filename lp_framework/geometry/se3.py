@@ -146,6 +146,18 @@ def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
     return torch.atan2(twice_sine / 2, cosine)
 
 
+def is_rotation(matrix: Tensor, tolerance: float = 1e-3) -> Tensor:
+    """Whether matrices `[..., 3, 3]` are rotations, `[...]`: orthonormal to `tolerance`, of positive determinant.
+
+    False where an entry is not finite.
+
+    >>> is_rotation(torch.stack([torch.eye(3), -torch.eye(3), 2 * torch.eye(3)]))
+    tensor([ True, False, False])
+    """
+    skew = (matrix.mT @ matrix - torch.eye(3).to(matrix)).abs().amax(dim=(-2, -1))
+    return (skew < tolerance) & (matrix.det() > 0)
+
+
 def rigid_transform(rotation: Tensor, translation: Tensor) -> Tensor:
     """Homogeneous matrix `[..., 4, 4]` of a rotation `[..., 3, 3]` followed by a translation `[..., 3]`.
 

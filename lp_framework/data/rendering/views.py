@@ -144,7 +144,9 @@ def render_object(
         "object": obj.name,
         "mesh": fingerprint(scene),
         "renderer": renderer.name,
-        **_demands(obj, protocol),
+        "ambiguity": obj.ambiguity,
+        "unique_answer": obj.unique_answer,
+        "protocol": asdict(protocol),
     }
     if folder.exists():
         _check_record(folder, record)
@@ -182,14 +184,9 @@ def _is_rendered(obj: MeshObject, root: str | Path, protocol: ViewProtocol) -> b
     """Whether `<root>/<name>` holds the object's views, by its record; the mesh is not looked at."""
     try:
         record = json.loads((Path(root) / obj.name / RECORD).read_text())
-        return all(record[key] == value for key, value in _demands(obj, protocol).items())
-    except (OSError, ValueError, KeyError, TypeError):
+        return bool(record["protocol"] == asdict(protocol))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
-
-
-def _demands(obj: MeshObject, protocol: ViewProtocol) -> dict[str, Any]:
-    """What a record must say besides the mesh."""
-    return {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer, "protocol": asdict(protocol)}
 
 
 def _transforms(poses: torch.Tensor, field_of_view_degrees: float, obj: MeshObject) -> dict[str, Any]:
@@ -205,14 +202,12 @@ def _transforms(poses: torch.Tensor, field_of_view_degrees: float, obj: MeshObje
 
 
 def _check_record(folder: Path, record: dict[str, Any]) -> None:
-    """`UserError` unless the folder was rendered from the same mesh under the same protocol."""
+    """`UserError` unless the folder was rendered from the same mesh under the same protocol; labels may differ, they
+    are not rendered."""
     try:
         found = json.loads((folder / RECORD).read_text())
-        old, new = (
-            {**each["protocol"], **{key: each[key] for key in ("mesh", "ambiguity", "unique_answer")}}
-            for each in (found, record)
-        )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        old, new = ({**each["protocol"], "mesh": each["mesh"]} for each in (found, record))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(
             f"{folder} exists and was not rendered by this program (it has no proper {RECORD}); "
             "choose another folder or delete it"
@@ -245,7 +240,7 @@ def render_objects(
     """Render objects into `<root>/<name>`, several at once, with a progress bar; finished ones are skipped.
 
     `check_meshes` loads the meshes of finished ones too, to see that the views were made from them; without it a
-    record of the same protocol and labels is believed.
+    record of the same protocol is believed.
     `workers` is the number of processes, by default one a CPU core; 1 renders in this process. Two runs into one
     folder take turns. A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
     """

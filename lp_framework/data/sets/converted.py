@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -42,6 +42,7 @@ from lp_framework.data.real_cameras import (
     spherical_camera,
     turn_towards_centre,
 )
+from lp_framework.data.sets.object_lists import LIST
 from lp_framework.errors import UserError
 from lp_framework.geometry import to_ifusion, view_pose
 from lp_framework.keyed_random import stable_id
@@ -63,6 +64,16 @@ class Photograph:
     size: tuple[int, int]
 
 
+class Annotated(NamedTuple):
+    """What a data set says of an object: photographs, `points` `[P, 3]` on its bounding box, how many photographs were
+    left out for which reason, and what else `conversion.json` is to keep."""
+
+    photographs: list[Photograph]
+    points: Tensor
+    left_out: Counter[str]
+    remarks: dict[str, Any]
+
+
 class ConvertedData(PairDataModule):
     """Views that are converted from photographs on first use.
 
@@ -76,8 +87,8 @@ class ConvertedData(PairDataModule):
     resolution: int
     split_seed: int
 
-    def photographs(self, name: str) -> tuple[list[Photograph], Tensor, Counter[str]]:
-        """An object's photographs, points `[P, 3]` on its bounding box, and how many were left out for which reason."""
+    def photographs(self, name: str) -> Annotated:
+        """An object's photographs and its extent, in the object's frame."""
         raise NotImplementedError
 
     def demands(self) -> dict[str, Any]:
@@ -93,16 +104,7 @@ class ConvertedData(PairDataModule):
     def prepare_data(self) -> None:
         """Convert what is not there yet, then as every data set."""
         self._check_settings()
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            with FileLock(self.path / ".convert.lock"):
-                missing = [name for name in self.names() if not is_converted(self.path / name, self.demands())]
-                for name in tracked(missing, "converting photographs"):
-                    self._convert(name)
-        except OSError as error:
-            raise UserError(
-                f"{self.path}: cannot be written ({error.strerror}); the objects finished so far are kept"
-            ) from error
+        convert_objects(self.path, self.names, self.demands(), self._convert)
         super().prepare_data()
 
     def _check_settings(self) -> None:
@@ -112,7 +114,7 @@ class ConvertedData(PairDataModule):
                 raise UserError(f"data.{name} must be at least {least}, got {value}")
 
     def _convert(self, name: str) -> None:
-        photographs, points, left_out = self.photographs(name)
+        photographs, points, left_out, remarks = self.photographs(name)
         views, more = sound_views(photographs, points)
         left_out += more
         wanted = self.train_views + self.test_views
@@ -138,6 +140,7 @@ class ConvertedData(PairDataModule):
         record = {
             "object": name,
             **self.demands(),
+            **remarks,
             "left_out": dict(left_out),
             "median_perspective_residual": float(np.median(residuals)),
             "largest_perspective_residual": max(residuals),
@@ -157,6 +160,38 @@ class ConvertedData(PairDataModule):
         write_converted(self.path / name, record, write)
 
 
+def convert_objects(
+    folder: Path, names: Callable[[], list[str]], demands: dict[str, Any], convert: Callable[[str], None]
+) -> None:
+    """Have the objects converted that `folder` does not hold yet, one after another.
+
+    A `UserError` of one object does not stop the others; at the end one `UserError` lists them all. `names` is called
+    while no other run converts into the folder.
+    """
+    failures: dict[str, list[str]] = {}  # names by what is wrong: what all objects share is said once
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder / ".convert.lock"):
+            objects = names()
+            missing = [name for name in objects if not is_converted(folder / name, demands)]
+            for name in tracked(missing, "converting photographs"):
+                try:
+                    convert(name)
+                except UserError as error:
+                    failures.setdefault(str(error), []).append(name)
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot be written ({error.strerror}); the objects finished so far are kept"
+        ) from error
+    if failures:
+        how = f"; mend them, or take their names out of {folder / LIST}" if (folder / LIST).is_file() else ""
+        told = [f"{', '.join(names_of)}: {failure}" for failure, names_of in failures.items()]
+        raise UserError(
+            f"{sum(map(len, failures.values()))} of {len(objects)} objects could not be converted{how}:"
+            + (f" {told[0]}" if len(told) == 1 else "".join(f"\n  {each}" for each in told))
+        )
+
+
 def write_transforms(folder: Path, frames: list[dict[str, Any]]) -> None:
     """The `transform.json` of a split with the priors' field of view."""
     content = {"camera_angle_x": math.radians(FIELD_OF_VIEW_DEGREES), "frames": frames}
@@ -168,7 +203,7 @@ def is_converted(folder: Path, demands: dict[str, Any]) -> bool:
     try:
         record = json.loads((folder / RECORD).read_text())
         return all(record[key] == value for key, value in demands.items())
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
 
 

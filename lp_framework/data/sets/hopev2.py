@@ -24,9 +24,10 @@ from PIL import Image
 from torch import Tensor
 
 from lp_framework.data.real_cameras import from_opencv_view, normalised, z_up_to_y_up
-from lp_framework.data.sets.converted import ConvertedData, Photograph
+from lp_framework.data.sets.converted import Annotated, ConvertedData, Photograph
+from lp_framework.data.sets.object_lists import ObjectLists, kept_lists
 from lp_framework.errors import UserError
-from lp_framework.geometry import rigid_transform
+from lp_framework.geometry import is_rotation, rigid_transform
 from lp_framework.registry import register
 
 ANNOTATIONS = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
@@ -91,15 +92,18 @@ class HOPEv2Data(ConvertedData):
 
     def names(self) -> list[str]:
         """The objects that have a model, `obj_000001` and so on."""
-        return [f"obj_{number:06d}" for number in sorted(self._boxes())]
+        return kept_lists(self.path, {}, self._available).seen
 
-    def photographs(self, name: str) -> tuple[list[Photograph], Tensor, Counter[str]]:
+    def _available(self) -> ObjectLists:
+        return ObjectLists([f"obj_{number:06d}" for number in sorted(self._boxes())], [])
+
+    def photographs(self, name: str) -> Annotated:
         number = int(name.removeprefix("obj_"))
         box = self._boxes()[number]
         instances = self._index().get(number, [])
         visible = [each for each in instances if each.visible >= self.least_visible]
         hidden = Counter({"occluded": len(instances) - len(visible)})
-        return [self._photograph(each, box) for each in visible], box.corners(), +hidden
+        return Annotated([self._photograph(each, box) for each in visible], box.corners(), +hidden, {})
 
     def _photograph(self, instance: Instance, box: Box) -> Photograph:
         scene, image = instance.scene, instance.image
@@ -108,8 +112,7 @@ class HOPEv2Data(ConvertedData):
         entry = content["scene_gt.json"][str(image)][instance.place]
         rotation = _numbers(entry, "cam_R_m2c", 9, annotation, image).view(3, 3)
         translation = _numbers(entry, "cam_t_m2c", 3, annotation, image)
-        skew = (rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max()
-        if not (skew < 1e-3 and rotation.det() > 0):
+        if not is_rotation(rotation):
             raise UserError(f"{annotation}: cam_R_m2c of image {image} is not a rotation")
         camera = from_opencv_view(rigid_transform(rotation, translation))
         if not (rotation @ box.centre + translation)[2] > 0:

@@ -73,8 +73,8 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
             raise UserError(f"{views}: cannot be written ({error.strerror}); choose another folder") from error
     try:
         content = json.loads(path.read_text())
-        found, lists = content["chosen"], ObjectLists(list(content["seen"]), list(content["unseen"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        found, lists = dict(content["chosen"]), ObjectLists(_names(content["seen"]), _names(content["unseen"]))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path}: is no list of objects as this program writes it; delete it to choose anew") from error
     differences = [
         f"{key} was {found.get(key)}, is {how.get(key)}" for key in {**found, **how} if found.get(key) != how.get(key)
@@ -84,3 +84,9 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
             f"{path}: its objects were chosen otherwise ({'; '.join(differences)}); choose another folder of views"
         )
     return lists
+
+
+def _names(value: Any) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise TypeError(f"a list of names is wanted, not {value!r}")
+    return value

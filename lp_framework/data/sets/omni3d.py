@@ -12,19 +12,19 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 from torch import Tensor
 
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import read_image
 from lp_framework.data.real_cameras import z_up_to_y_up
-from lp_framework.data.sets.converted import is_converted, write_converted, write_transforms
-from lp_framework.data.views import LARGEST_RESIDUAL
+from lp_framework.data.sets.converted import convert_objects, write_converted, write_transforms
+from lp_framework.data.views import LARGEST_RESIDUAL, ObjectViews
 from lp_framework.errors import UserError
-from lp_framework.geometry import rigid_transform, spherical_residual, to_ifusion, view_pose
+from lp_framework.geometry import is_rotation, rigid_transform, spherical_residual, to_ifusion, view_pose
 from lp_framework.registry import register
 
 RADIUS = 1.85
@@ -55,18 +55,21 @@ class Omni3DData(PairDataModule):
 
     def prepare_data(self) -> None:
         """Convert what is not there yet, then as every data set."""
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            with FileLock(self.path / ".convert.lock"):
-                demands = {"source": self.source.resolve().name}
-                for name in self.names():
-                    if not is_converted(self.path / name, demands):
-                        self._convert(name, demands)
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another data.views") from error
+        convert_objects(self.path, self.names, self._demands(), self._convert)
         super().prepare_data()
 
-    def _convert(self, name: str, record: dict[str, str]) -> None:
+    def _demands(self) -> dict[str, Any]:
+        return {"source": self.source.resolve().name}
+
+    def _on_disk(self, split: str) -> list[ObjectViews]:
+        if split != "test":
+            raise UserError(
+                f"{self.source}: data=omni3d has test views only, so there is nothing to train on; "
+                "evaluate on it, or train on other data"
+            )
+        return super()._on_disk(split)
+
+    def _convert(self, name: str) -> None:
         cameras = omni3d_cameras(self.source, name)
 
         def write(folder: Path) -> None:
@@ -84,7 +87,7 @@ class Omni3DData(PairDataModule):
                 frames.append({"file_path": f"{view}.png", "transform_matrix": camera.tolist(), "latlon": latlon})
             write_transforms(folder / "test", frames)
 
-        write_converted(self.path / name, {"object": name, **record}, write)
+        write_converted(self.path / name, {"object": name, **self._demands()}, write)
 
 
 def omni3d_objects(root: str | Path) -> list[str]:
@@ -116,14 +119,13 @@ def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
 
 def _camera(file: Path) -> Tensor:
     try:
-        matrix = np.asarray(np.load(file), dtype=np.float64)
+        matrix = np.load(file).astype(np.float64, casting="same_kind")
     except Exception as error:  # damaged files raise anything from EOFError to SyntaxError
         raise UserError(f"{file}: is not a readable array ({' '.join(str(error).split())})") from error
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise UserError(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers, got {list(matrix.shape)}")
     rotation = torch.from_numpy(matrix[:3, :3])
-    skew = (rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max()
-    if not (skew < 1e-3 and rotation.det() > 0):
+    if not is_rotation(rotation):
         raise UserError(f"{file}: is not a rigid camera-to-world transform")
     camera = z_up_to_y_up(rigid_transform(rotation, torch.from_numpy(matrix[:3, 3])))
     if not camera[:3, 3].norm() > 1e-6:

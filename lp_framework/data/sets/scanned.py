@@ -30,14 +30,46 @@ _Z_UP_TO_Y_UP = np.eye(4)[[1, 2, 0, 3]]
 
 
 class ScannedData(RenderedData):
-    """Objects of a download, `seen` ones to train on and `unseen` ones to evaluate on; `which` of them is in use."""
+    """Objects of a download, `seen` ones to train on and `unseen` ones to evaluate on; `objects` says which are in use.
 
-    meshes: Path
-    renderings: Path | None
-    seen: int
-    unseen: int
-    which: str
-    split_seed: int
+    The views go to `views`, by default `datasets/` and the name of the `release`.
+    """
+
+    release: str
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        path: str,
+        views: str | None = None,
+        renderings: str | None = None,
+        seen: int = 70,
+        unseen: int = 10,
+        objects: Literal["seen", "unseen"] = "seen",
+        split_seed: int = 0,
+        resolution: int = 512,
+        test_views: int = 8,
+        latitude_step_degrees: float = 7.5,
+        longitude_step_degrees: float = 15.0,
+        workers: int | None = None,
+        cache: str = "datasets/cache",
+        image_size: int = 256,
+        batch_pairs: int = 1024,
+        block: int = 8,
+        validation_views: int = 8,
+        seed: int = 0,
+    ) -> None:
+        folder = views if views is not None else f"datasets/{self.release}"
+        super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
+        self.meshes, self.renderings = Path(path), None if renderings is None else Path(renderings)
+        self.seen, self.unseen, self.which, self.split_seed = seen, unseen, objects, split_seed
+        self.renderer, self.workers = renderer, workers
+        self.protocol = ViewProtocol(
+            resolution=resolution,
+            test_views=test_views,
+            latitude_step_degrees=latitude_step_degrees,
+            longitude_step_degrees=longitude_step_degrees,
+        )
 
     def available(self) -> list[str]:
         """Names of the objects in the download; `UserError`, with the file looked for, where there are none."""
@@ -83,38 +115,7 @@ class ScannedData(RenderedData):
 class GSOData(ScannedData):
     """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
 
-    def __init__(
-        self,
-        renderer: Renderer,
-        path: str,
-        views: str = "datasets/gso",
-        renderings: str | None = None,
-        seen: int = 70,
-        unseen: int = 10,
-        objects: Literal["seen", "unseen"] = "seen",
-        split_seed: int = 0,
-        resolution: int = 512,
-        test_views: int = 8,
-        latitude_step_degrees: float = 7.5,
-        longitude_step_degrees: float = 15.0,
-        workers: int | None = None,
-        cache: str = "datasets/cache",
-        image_size: int = 256,
-        batch_pairs: int = 1024,
-        block: int = 8,
-        validation_views: int = 8,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(views, cache, image_size, batch_pairs, block, validation_views, seed)
-        self.meshes, self.renderings = Path(path), None if renderings is None else Path(renderings)
-        self.seen, self.unseen, self.which, self.split_seed = seen, unseen, objects, split_seed
-        self.renderer, self.workers = renderer, workers
-        self.protocol = ViewProtocol(
-            resolution=resolution,
-            test_views=test_views,
-            latitude_step_degrees=latitude_step_degrees,
-            longitude_step_degrees=longitude_step_degrees,
-        )
+    release = "gso"
 
     def available(self) -> list[str]:
         """Names of the folders with a mesh."""
@@ -136,38 +137,7 @@ class GSOData(ScannedData):
 class OO3DData(ScannedData):
     """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
 
-    def __init__(
-        self,
-        renderer: Renderer,
-        path: str,
-        views: str = "datasets/oo3d",
-        renderings: str | None = None,
-        seen: int = 70,
-        unseen: int = 0,
-        objects: Literal["seen", "unseen"] = "seen",
-        split_seed: int = 0,
-        resolution: int = 512,
-        test_views: int = 8,
-        latitude_step_degrees: float = 7.5,
-        longitude_step_degrees: float = 15.0,
-        workers: int | None = None,
-        cache: str = "datasets/cache",
-        image_size: int = 256,
-        batch_pairs: int = 1024,
-        block: int = 8,
-        validation_views: int = 8,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(views, cache, image_size, batch_pairs, block, validation_views, seed)
-        self.meshes, self.renderings = Path(path), None if renderings is None else Path(renderings)
-        self.seen, self.unseen, self.which, self.split_seed = seen, unseen, objects, split_seed
-        self.renderer, self.workers = renderer, workers
-        self.protocol = ViewProtocol(
-            resolution=resolution,
-            test_views=test_views,
-            latitude_step_degrees=latitude_step_degrees,
-            longitude_step_degrees=longitude_step_degrees,
-        )
+    release = "oo3d"
 
     def available(self) -> list[str]:
         """Names of the objects with a scan: those of their folders, such as "dinosaur_002"."""

@@ -1,0 +1,72 @@
+"""Files of labels: what they say of a folder's objects, and what is wrong with them."""
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+from lp_framework.data.sets.object_labels import Label, read_labels
+from lp_framework.errors import UserError
+
+NAMES = ["mug", "teapot", "vase"]
+
+
+@pytest.fixture
+def file(tmp_path) -> Path:
+    return tmp_path / "labels.yaml"
+
+
+def read(file: Path, text: str) -> dict[str, Label]:
+    file.write_text(text, encoding="utf-8")
+    return read_labels(file, NAMES, Path("meshes"))
+
+
+def test_labels_by_object(file):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        labels = read(
+            file,
+            "mug: {ambiguity: unique, reason: its handle}\nteapot:\n  ambiguity: twofold\n"
+            "vase: {ambiguity: continuous, unique_answer: true, reason: café painted on one side}\n",
+        )
+    assert labels == {"mug": Label("unique"), "teapot": Label("twofold"), "vase": Label("continuous", True)}
+
+
+def test_objects_that_are_left_out_are_named(file):
+    with pytest.warns(UserWarning, match=r"labels\.yaml: leaves out, so that they stay unlabelled: mug, vase$"):
+        assert read(file, "teapot: {ambiguity: unique}") == {"teapot": Label("unique")}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mugg: {ambiguity: unique}", r"meshes has no object 'mugg'; did you mean 'mug'\?"),
+        ("7: {ambiguity: unique}", r"meshes has no object '7'"),
+        ("mug: unique", r"object 'mug' needs ambiguity: unique, twofold or continuous"),
+        ("mug: {reason: its handle}", r"object 'mug' needs ambiguity"),
+        ("mug: {ambiguity: twofolds}", r"object 'mug': ambiguity 'twofolds' is none of .*; did you mean 'twofold'\?"),
+        ("mug: {ambiguity: unlabelled}", r"object 'mug': ambiguity 'unlabelled' is none of unique, twofold, continuou"),
+        ("mug: {ambiguity: [unique]}", r"object 'mug': ambiguity \['unique'\] is none of"),
+        ("mug: {ambiguity: unique, unique_answer: maybe}", r"object 'mug': unique_answer must be true or false"),
+        ("mug: {ambiguity: unique, unique_answr: true}", r"'unique_answr' is none .*; did you mean 'unique_answer'\?"),
+        ("mug: {ambiguity: unique, reason: 3}", r"object 'mug': reason must be a text, got 3"),
+        ("- mug", r"must give every object its label, as in 'mug: \{ambiguity: unique\}'"),
+        ("", r"must give every object its label"),
+        ("mug: {ambiguity: unique", r"is not readable YAML \("),
+        ("mug: \0", r"is not readable YAML \("),
+    ],
+)
+def test_bad_files(file, text, message):
+    with pytest.raises(UserError, match=message) as caught:
+        read(file, text)
+    assert str(caught.value).startswith(str(file)) and "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(file, tmp_path):
+    with pytest.raises(UserError, match=r"labels\.yaml: there is no such file of labels"):
+        read_labels(file, NAMES, Path("meshes"))
+    with pytest.raises(UserError, match="is not readable YAML"):
+        read_labels(tmp_path, NAMES, Path("meshes"))
+    file.write_bytes(b"mug: \xff")
+    with pytest.raises(UserError, match="is not readable YAML"):
+        read_labels(file, NAMES, Path("meshes"))
