@@ -18,7 +18,10 @@ _NOISE = 0x4E4F  # separates the prior's noise from a solver's other draws under
 
 def keyed_noise(prior: Prior, *keys: Tensor | int) -> Tensor:
     """Standard normal noise `[..., *latent_shape]` (float32) for integer keys that broadcast to `[...]`."""
-    draws = keyed_normal(_NOISE, *keys, count=math.prod(prior.latent_shape))
+    device = next((key.device for key in keys if isinstance(key, Tensor)), None)
+    # Numbers are filled in on the device: to copy one there from the host waits for all that the device has to do.
+    filled = (key if isinstance(key, Tensor) else torch.full((), key, device=device) for key in (_NOISE, *keys))
+    draws = keyed_normal(*filled, count=math.prod(prior.latent_shape))
     return draws.float().unflatten(-1, prior.latent_shape)
 
 
