@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lp_framework.errors import UserError
 
-GROUPS = ("model", "backbone", "prior", "solver", "start", "data", "renderer")
+GROUPS = ("model", "backbone", "prior", "solver", "start", "data", "renderer", "figure")
 BUILT_IN = "built-in"
 PACKAGE = "lp_framework"
 
@@ -55,7 +55,7 @@ def built_ins() -> dict[Key, Entry]:
         text = file.read_text(encoding="utf-8")
         if "@register(" not in text:
             continue
-        for node in _tree(file).body:
+        for node in syntax_tree(file).body:
             for key in _registrations(node):
                 if key in found:
                     raise UserError(f"{key[0]} '{key[1]}' is registered twice: in {found[key].module} and in {file}")
@@ -64,7 +64,8 @@ def built_ins() -> dict[Key, Entry]:
 
 
 @cache
-def _tree(file: Path) -> ast.Module:
+def syntax_tree(file: Path) -> ast.Module:
+    """What a source file says."""
     return ast.parse(file.read_text(encoding="utf-8"), str(file))
 
 
@@ -80,7 +81,8 @@ def _registrations(node: ast.stmt) -> Iterator[Key]:
 
 
 def _describe(key: Key, file: Path, node: ast.ClassDef) -> Entry:
-    arguments = _constructor(file, node)
+    found = constructor_of(file, node.name)
+    arguments = _signature(*found) if found else []
     return Entry(
         *key,
         _module_name(file),
@@ -97,34 +99,43 @@ def _module_name(file: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def _constructor(file: Path, node: ast.ClassDef) -> list[Argument]:
-    """The arguments of a class's `__init__`, its own or that of the first base class in this package that has one."""
+def constructor_of(file: Path, name: str) -> tuple[Path, ast.FunctionDef] | None:
+    """The `__init__` of a class in a source file and the file that it is in: the class's own, or that of the first base
+    class in this package that has one."""
+    found = _class_named(file, name)
+    if found is None:
+        return None
+    file, node = found
     for statement in node.body:
         if isinstance(statement, ast.FunctionDef) and statement.name == "__init__":
-            return _signature(file, statement.args)
+            return file, statement
     for base in node.bases:
-        found = _class_named(file, base.id) if isinstance(base, ast.Name) else None
-        if found and (arguments := _constructor(*found)):
-            return arguments
-    return []
+        inherited = constructor_of(file, base.id) if isinstance(base, ast.Name) else None
+        if inherited is not None:
+            return inherited
+    return None
+
+
+def source_file(module: str) -> Path:
+    """The source of a module of this package."""
+    source = Path(__file__).parents[1].joinpath(*module.split("."))
+    return source / "__init__.py" if source.is_dir() else source.with_suffix(".py")
 
 
 def _class_named(file: Path, name: str) -> tuple[Path, ast.ClassDef] | None:
     """The class that a name means at the top level of a source file, followed through imports from this package."""
-    for statement in _tree(file).body:
+    for statement in syntax_tree(file).body:
         if isinstance(statement, ast.ClassDef) and statement.name == name:
             return file, statement
         if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(f"{PACKAGE}."):
             for alias in statement.names:
                 if (alias.asname or alias.name) == name:
-                    source = Path(__file__).parents[1].joinpath(*statement.module.split("."))  # type: ignore[union-attr]
-                    for candidate in (source.with_suffix(".py"), source / "__init__.py"):
-                        if candidate.exists():
-                            return _class_named(candidate, alias.name)
+                    return _class_named(source_file(typing.cast(str, statement.module)), alias.name)
     return None
 
 
-def _signature(file: Path, arguments: ast.arguments) -> list[Argument]:
+def _signature(file: Path, constructor: ast.FunctionDef) -> list[Argument]:
+    arguments = constructor.args
     positional = [*arguments.posonlyargs, *arguments.args]
     defaults = [*[None] * (len(positional) - len(arguments.defaults)), *arguments.defaults]
     pairs = [*zip(positional, defaults, strict=True), *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)]
@@ -140,7 +151,7 @@ def _signature(file: Path, arguments: ast.arguments) -> list[Argument]:
 
 def _value(file: Path, default: ast.expr) -> ast.expr:
     """The default itself, or the value of the constant that it names: of `A = 1` or `A, B = 1, 2` in the same file."""
-    for statement in _tree(file).body:
+    for statement in syntax_tree(file).body:
         match statement:
             case ast.Assign(targets=[ast.Name(id=name)], value=value):
                 constants = {name: value}

@@ -190,7 +190,7 @@ def test_every_built_in_has_a_config_of_its_settings(group, name):
 def test_the_value_of_a_default_that_is_a_constant_is_read(tmp_path):
     source = "A, B = 1, (2, 3)\nC = 'c'\nclass X:\n    def __init__(self, a=A, *, b=B, c=C, d=D, e=4): pass\n"
     (tmp_path / "x.py").write_text(source)
-    arguments = registry_sources._constructor(tmp_path / "x.py", registry_sources._tree(tmp_path / "x.py").body[-1])
+    arguments = registry_sources._signature(*registry_sources.constructor_of(tmp_path / "x.py", "X"))
     assert list(map(str, arguments)) == ["a=1", "b=(2, 3)", "c='c'", "d=D", "e=4"]
 
 

@@ -97,7 +97,7 @@ def cameras_figure(
     distance = furthest * (NEAR_BY if len(poses) <= 5 else 0.8 * NEAR_BY)
     planes = [image_plane(camera, distance, half_angle) for camera in cameras]
 
-    seen = view.project(np.concatenate([middle, *planes, cameras[:, :3, 3], _ring(1.14 * furthest)]))
+    seen = view.project(np.concatenate([middle, *planes, cameras[:, :3, 3], ring(1.14 * furthest)]))
     low, high = seen.min(axis=0) - 0.06 * furthest, seen.max(axis=0) + 0.06 * furthest
     tall = min(TALLEST, WIDTH * (high[1] - low[1]) / (high[0] - low[0]))
     cards = min(len(images), MOST_CARDS)
@@ -113,8 +113,9 @@ def cameras_figure(
     )
     figure.text(1 - SIDE / WIDTH, 1 - 0.12 / height, note, color=MUTED, fontsize=7.5, va="top", ha="right")
     scene = figure.add_axes((0.0, 1 - (TOP + tall) / height, 1.0, tall / height))
-    _draw_ground(scene, view, furthest)
-    _draw_image(scene, images[0], view.project(middle), order=100.0)
+    draw_ground(scene, view, furthest)
+    _label_ground(scene, view, furthest)
+    draw_image(scene, images[0], view.project(middle), order=100.0)
     for index, (camera, plane) in enumerate(zip(cameras, planes, strict=True)):
         centre = camera[:3, 3]
         order = 100.0 + 10 * float(view.nearness(centre)) / furthest
@@ -147,24 +148,29 @@ def _on_white(image: NDArray) -> NDArray:
     return np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
 
 
-def _ring(radius: float) -> NDArray:
+def ring(radius: float) -> NDArray:
+    """A circle `[181, 3]` around the object, at latitude 0."""
     turn = np.linspace(0, 2 * math.pi, 181)
     return radius * np.stack([np.sin(turn), np.zeros_like(turn), np.cos(turn)], axis=-1)
 
 
-def _draw_ground(axes: Axes, view: Viewpoint, radius: float) -> None:
-    """The plane of latitude 0, with longitudes."""
-    axes.add_patch(Polygon(view.project(_ring(radius)), facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
-    axes.add_patch(Polygon(view.project(_ring(radius / 2)), fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
+def draw_ground(axes: Axes, view: Viewpoint, radius: float) -> None:
+    """The plane of latitude 0, with a line every 30 degrees of longitude."""
+    axes.add_patch(Polygon(view.project(ring(radius)), facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
+    axes.add_patch(Polygon(view.project(ring(radius / 2)), fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
     spokes = []
     for degrees in range(0, 360, 30):
         angle = math.radians(degrees)
         direction = np.array([math.sin(angle), 0.0, math.cos(angle)])
         spokes.append(view.project(np.stack([0 * direction, radius * direction])))
-        if degrees % 90 == 0:
-            x, y = view.project(1.09 * radius * direction)
-            axes.text(x, y, f"{degrees}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
     axes.add_collection(LineCollection(spokes, colors=FAINT, linewidths=0.4, zorder=1.1))
+
+
+def _label_ground(axes: Axes, view: Viewpoint, radius: float) -> None:
+    for degrees in range(0, 360, 90):
+        angle = math.radians(degrees)
+        x, y = view.project(1.09 * radius * np.array([math.sin(angle), 0.0, math.cos(angle)]))
+        axes.text(x, y, f"{degrees}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
 
 
 def _draw_camera(
@@ -177,13 +183,13 @@ def _draw_camera(
     axes.plot(*height, color=MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
     axes.plot(*sight, color=colour, linewidth=0.7, linestyle=(0, (2, 3)), zorder=3)
     axes.add_patch(Polygon(corners, facecolor="white", edgecolor="none", alpha=0.65, zorder=order))
-    _draw_image(axes, image, corners, order + 0.1)
+    draw_image(axes, image, corners, order + 0.1)
     axes.add_patch(Polygon(corners, fill=False, edgecolor=colour, linewidth=1.0, joinstyle="round", zorder=order + 0.2))
     edges = [np.stack([apex, corner]) for corner in corners]
     axes.add_collection(LineCollection(edges, colors=colour, linewidths=0.7, zorder=order + 0.2))
 
 
-def _draw_image(axes: Axes, image: NDArray, corners: NDArray, order: float) -> None:
+def draw_image(axes: Axes, image: NDArray, corners: NDArray, order: float) -> None:
     """An image in a parallelogram `[4, 2]` (as `image_plane`); nothing where that is seen edge-on."""
     right, up = corners[1] - corners[0], corners[3] - corners[0]
     if abs(right[0] * up[1] - right[1] * up[0]) < 1e-3 * (right @ right + up @ up):

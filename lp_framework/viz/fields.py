@@ -131,7 +131,7 @@ def field_figure(
     """Reference and query image `[H, W, 3]` beside maps, one below the other, with the true relative pose `[3]`."""
     limit = _latitude_limit(truth, maps)
     columns = 1 if len(maps) > 1 else 2  # of images
-    greatest = max((_longest(each.arrows) for each in maps if each.arrows is not None), default=0.0)
+    greatest = max((longest(each.arrows) for each in maps if each.arrows is not None), default=0.0)
     right = BAR if greatest > 0 else 2 * SIDE
     # Images are as high as the maps, whose scale is the same along both axes.
     wide = (WIDTH - SIDE - 0.1 * (columns - 1) - LABELS - right) / (1 + columns * limit / 180)
@@ -191,17 +191,21 @@ def draw_map(axes: Axes, content: FieldMap, truth: NDArray, limit: float, greate
         axes.set(xlim=(0, 360), ylim=(-limit, limit))  # imshow fits them to the image
     quiver = None
     if content.arrows is not None and greatest > 0:
-        grid = content.arrows
-        # An arrow's length is its score's, the longest one as long as cells are apart.
-        quiver = axes.quiver(
-            grid.longitude, grid.latitude, grid.score[..., 1], grid.score[..., 0], _magnitude(grid),
-            cmap=MAGNITUDE, norm=Normalize(0, greatest), angles="xy", scale_units="xy",
-            scale=greatest / (1.15 * ARROW_SPACING), pivot="mid", units="inches", width=0.0125,
-            headwidth=4, headlength=4.5, headaxislength=4, minlength=0.5, zorder=1,
-        )  # fmt: skip
+        quiver = draw_arrows(axes, content.arrows, greatest)
     _draw_ways(axes, content, limit)
     _points(axes, truth[None], limit, **TRUTH_MARK, zorder=7)
     return quiver
+
+
+def draw_arrows(axes: Axes, grid: Grid, greatest: float) -> Quiver:
+    """The score's arrows in degrees; one of a score of length `greatest` is about as long as columns are apart."""
+    spacing = 360 / len(grid.longitude)
+    return axes.quiver(
+        grid.longitude, grid.latitude, grid.score[..., 1], grid.score[..., 0], _magnitude(grid),
+        cmap=MAGNITUDE, norm=Normalize(0, greatest), angles="xy", scale_units="xy",
+        scale=greatest / (1.15 * spacing), pivot="mid", units="inches", width=0.0125,
+        headwidth=4, headlength=4.5, headaxislength=4, minlength=0.5, zorder=1,
+    )  # fmt: skip
 
 
 TRUTH_MARK: dict[str, Any] = {
@@ -262,7 +266,8 @@ def _magnitude(grid: Grid) -> NDArray:
     return np.hypot(grid.score[..., 0], grid.score[..., 1])
 
 
-def _longest(grid: Grid) -> float:
+def longest(grid: Grid) -> float:
+    """The greatest length of the score in the plane of the map, 0 for a field of nothing."""
     return float(np.nan_to_num(_magnitude(grid), posinf=0.0).max())
 
 

@@ -25,7 +25,7 @@ ROTATION_RECALL = [f"R(R)@{degrees}" for degrees in ROTATION_THRESHOLDS]
 
 def sweep_figure(table: SweepTable) -> Figure | None:
     """What the settings that vary call for: shares over a number, or the rows beside each other; None for one row."""
-    axis = next((key for key in AXES if _is_swept(table, key)), None)
+    axis = next((key for key in AXES if is_swept(table, key)), None)
     paper = "the paper: other data, other prior"
     if axis is not None and len({label(_others(row, axis)) for row in table.rows}) <= len(COLOURS):
         return curves_figure(_panels(table, axis), paper)
@@ -51,7 +51,7 @@ def cost_figure(table: SweepTable) -> Figure | None:
     groups: dict[str, list[Row]] = {}
     for row in table.rows:
         groups.setdefault(str(row.settings.get(SOLVER)), []).append(row)
-    if not 1 < len(groups) <= len(COLOURS) or _is_swept(table, "start.count"):
+    if not 1 < len(groups) <= len(COLOURS) or is_swept(table, "start.count"):
         return None
     panels = []
     for name in ROTATION_RECALL:
@@ -168,7 +168,8 @@ def _curves(
     return curves
 
 
-def _is_swept(table: SweepTable, key: str) -> bool:
+def is_swept(table: SweepTable, key: str) -> bool:
+    """Whether the table has several numbers of the setting `key`."""
     values = [row.settings.get(key) for row in table.rows]
     numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     return numbers and len(set(values)) > 1

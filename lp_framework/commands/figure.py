@@ -1,0 +1,49 @@
+"""`figure`: a figure of the paper, of any data, prior and models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+
+from lp_framework import registry
+from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.device import choose_device
+from lp_framework.evaluation.tables import write_json
+from lp_framework.figures.base import PaperFigure
+from lp_framework.viz.style import save_figure
+
+
+@orderly_console()
+def run(config: DictConfig) -> None:
+    """Write `figure_NAME.png` and `.pdf` into this run's folder, and `figure.json` with its caption."""
+    folder = run_folder()
+    seed_run(config.seed)
+    device = choose_device(config.accelerator)
+    name = config.figure.name
+    wanted = registry.component_names(registry.get("figure", name))
+    components: dict[str, Any] = {}
+    if "data" in wanted:
+        components["data"] = build_data(config)
+        components["data"].evaluate_on("ordered", config.seed)  # only the test views
+    if "prior" in wanted:
+        components["prior"] = registry.build("prior", config.prior)
+    figure: PaperFigure[Any] = registry.build("figure", config.figure, **components)
+    if "data" in wanted:
+        components["data"].prepare_data()
+    for part in figure.networks():
+        part.to(device)
+    contents = figure.gather(config.seed, device)
+    files = save_figure(figure.draw(contents), folder / f"figure_{name}")
+    record = {
+        "files": [file.name for file in files],
+        "caption": figure.caption(contents),
+        "seed": config.seed,
+        "config": plain(config),
+        "versions": versions(),
+    }
+    write_json(folder / "figure.json", record)
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(f"caption: {record['caption']}", markup=False)
+    console.print(f"picture: {files[0]}, {files[1].name}", markup=False)

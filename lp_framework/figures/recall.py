@@ -1,0 +1,57 @@
+"""Recall against the number of random starts (Evaluation under Various Numbers of Initializations)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+
+from lp_framework.errors import UserError
+from lp_framework.evaluation.runs import find_runs
+from lp_framework.evaluation.sweep_tables import Objects, SweepTable, sweep_tables
+from lp_framework.figures.base import PaperFigure
+from lp_framework.registry import register
+from lp_framework.viz.sweep_pictures import is_swept, sweep_figure
+
+EXPERIMENT, COUNT = "starts", "start.count"
+
+
+@register("figure", "recall")
+class RecallFigure(PaperFigure[SweepTable]):
+    """Recall within 30 degrees against the number of random starts and against time, a curve a solver.
+
+    `runs` is a folder with finished jobs of `eval experiment=starts`; `objects` says whether all objects count, or
+    only those with a unique answer.
+    """
+
+    def __init__(self, runs: str = "runs/multirun/eval/starts", objects: Objects = "unique_answer") -> None:
+        self.runs, self.objects = runs, objects
+
+    def gather(self, seed: int, device: torch.device) -> SweepTable:
+        """The table of the experiment; nothing is drawn at random."""
+        make = f"`python -m lp_framework eval experiment={EXPERIMENT}` makes them"
+        if not Path(self.runs).is_dir():
+            raise UserError(f"figure.runs={self.runs}: there is no such folder of finished runs; {make}")
+        found, _ = find_runs([Path(self.runs)])
+        tables, unlabelled = sweep_tables(found, self.objects)
+        table = next((each for each in tables if each.experiment == EXPERIMENT and is_swept(each, COUNT)), None)
+        if table is None:
+            reason = unlabelled[0].reason if unlabelled else f"no finished runs with several numbers of starts; {make}"
+            raise UserError(f"figure.runs={self.runs}: {reason}")
+        return table
+
+    def draw(self, contents: SweepTable) -> Figure:
+        """See `viz.sweep_pictures`."""
+        figure = sweep_figure(contents)
+        assert figure is not None  # the number of starts varies
+        return figure
+
+    def caption(self, contents: SweepTable) -> str:
+        """See `PaperFigure`."""
+        seeds = max(len(row.seeds) for row in contents.rows)
+        over = "objects with a unique answer" if self.objects == "unique_answer" else "all objects"
+        return (
+            "Recall within 30 degrees (and a translation error of 0.2) for different numbers of random starts, and for "
+            f"the seconds that they take, over {over}; bars: standard deviation over {seeds} seeds."
+        )

@@ -1,0 +1,350 @@
+"""The paper's figures by name: their arrays against mathematics, and the command from settings to files."""
+
+from __future__ import annotations
+
+import json
+import math
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from exact_prior import ExactPrior, image_of
+from PIL import Image
+from result_folders import metrics, write_result
+from tiny_runs import Commands
+from view_folders import write_objects
+
+from lp_framework.data.rendering.raycast import RaycastRenderer
+from lp_framework.data.sources import MeshData, RenderingsData
+from lp_framework.errors import UserError
+from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
+from lp_framework.figures.cameras import CamerasFigure
+from lp_framework.figures.failures import FailuresFigure
+from lp_framework.figures.generated import generated_views
+from lp_framework.figures.landscapes import LandscapesFigure
+from lp_framework.figures.model_fields import density, field_error, model_grid
+from lp_framework.figures.prior_field import prior_field
+from lp_framework.figures.shown_pairs import shown_pairs
+from lp_framework.figures.trajectories import TrajectoriesFigure
+from lp_framework.geometry import apply_relative_pose, relative_pose
+from lp_framework.models.objectives import PoseKernel
+from lp_framework.solvers.base import Pairs
+from lp_framework.viz.camera_methods import RED, CameraScene, camera_methods_figure, colour_of
+from lp_framework.viz.landscape_panels import FailureRow, failures_figure
+from lp_framework.viz.pictures import ExactModel
+
+CPU = torch.device("cpu")
+VIEWS = torch.tensor([[0.1, 0.4, 1.5], [0.3, 2.9, 1.7], [-0.2, 5.0, 1.3], [0.0, 1.0, 1.6]])
+PAIRS = Pairs(image_of(VIEWS), torch.tensor([0, 2]), torch.tensor([1, 3]), torch.tensor([5, 6]))
+TRUTH = relative_pose(VIEWS[[0, 2]], VIEWS[[1, 3]])
+TWO_VALLEYS = ExactPrior((0.0, math.pi), (0.0, 0.3))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Test views of three objects, ready for use."""
+    folder = tmp_path_factory.mktemp("views")
+    write_objects(folder / "views", test=4)
+    data = RenderingsData(str(folder / "views"), cache=str(folder / "cache"), image_size=16)
+    data.evaluate_on("ordered", 0)
+    data.prepare_data()
+    return data
+
+
+# ---------------------------------------------------------------- arrays
+
+
+def test_a_priors_field_is_minus_the_gradient_of_its_landscape():
+    poses = torch.rand(2, 11, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 6.0, 0.5])
+    settings = ([100, 900], 2, 3)
+    prior = ExactPrior((0.0, math.pi), (0.0, 0.3), noisy=0.1)
+    field = prior_field(prior, PAIRS, poses, *settings, batch=6)
+    step = 1e-2
+    for axis in range(3):
+        nudge = step * torch.eye(3)[axis]
+        ahead, behind = (prior_field(prior, PAIRS, poses + sign * nudge, *settings).energy for sign in (1, -1))
+        torch.testing.assert_close(field.score[..., axis], (behind - ahead) / (2 * step), atol=1e-3, rtol=1e-2)
+    latitude, longitude = torch.tensor([-0.2, 0.3]), torch.arange(5) * (2 * math.pi / 5)
+    energies = prior_landscapes(prior, PAIRS, TRUTH[:, 2], latitude, longitude, *settings)
+    plane = torch.cartesian_prod(latitude, longitude)
+    same = torch.cat([plane.expand(2, -1, 2), TRUTH[:, None, 2:].expand(-1, 10, 1)], dim=-1)
+    torch.testing.assert_close(prior_field(prior, PAIRS, same, *settings).energy.view_as(energies), energies)
+
+
+def test_a_density_is_one_where_the_energy_is_least():
+    latitude, longitude = landscape_grid()
+    energy = 2 - longitude.cos() + latitude.square()[:, None]
+    values = density(energy, latitude, longitude, TRUTH[0]).energy
+    assert values.max() == 1 and values.flatten()[energy.argmin()] == 1
+    torch.testing.assert_close(values.log(), energy.min() - energy)
+
+
+def test_the_exact_field_has_no_error_and_one_half_as_long_is_half_off():
+    class Half(ExactModel):
+        def field(self, condition, pose):
+            field = super().field(condition, pose)
+            return field._replace(score=field.score / 2)
+
+    one = Pairs(PAIRS.images, PAIRS.reference[:1], PAIRS.query[:1], PAIRS.ids[:1])
+    kernel = PoseKernel()
+    assert field_error(ExactModel(kernel, TRUTH[0]), one, TRUTH[:1]) == pytest.approx(0, abs=1e-6)
+    assert field_error(Half(kernel, TRUTH[0]), one, TRUTH[:1]) == pytest.approx(0.5, abs=1e-4)
+    grid = model_grid(ExactModel(kernel, TRUTH[0]), one, TRUTH[0])
+    towards = np.radians(grid.latitude[:, None]) - TRUTH[0, 0].item()
+    np.testing.assert_allclose(grid.score[..., 0], np.broadcast_to(-towards, grid.score.shape[:2]), atol=1e-5)
+    np.testing.assert_allclose(grid.score[..., 2], 0, atol=1e-6)  # at the true radius
+
+
+def test_pairs_are_the_views_that_were_asked_for(data):
+    shown = shown_pairs(data, ["tram", "cup"], [(2, 0), (1, 3)], CPU)
+    table = data.table("test")
+    for number, (name, places) in enumerate((("tram", (2, 0)), ("cup", (1, 3)))):
+        views = table.views_of(table.names.index(name))[list(places)]
+        torch.testing.assert_close(shown.poses[number], table.poses[views])
+        for place, view in enumerate(views):
+            with Image.open(table.files[view]) as file:
+                rgba = np.asarray(file).astype(float)
+            alpha = rgba[..., 3:] / 255
+            assert np.abs(rgba[..., :3] * alpha + 255 * (1 - alpha) - shown.images[number, place]).max() <= 1.5
+    assert shown.ambiguities == ["twofold", "unique"]
+    torch.testing.assert_close(shown.truth, relative_pose(shown.poses[:, 0], shown.poses[:, 1]).float())
+    for wrong, message in (
+        ((["cup"], [(0, 4)]), "object 'cup' has test views 0 to 3, there is no query 4"),
+        ((["cup"], [(1, 1)]), "reference and query must be two views, got 1 for both"),
+        ((["cap"], [(0, 1)]), "no object 'cap'; did you mean 'cup'"),
+    ):
+        with pytest.raises(UserError, match=message):
+            shown_pairs(data, *wrong, CPU)
+
+
+def test_landscapes_say_how_many_minima_they_have(data):
+    def gathered(prior):
+        return LandscapesFigure(data, prior, ["cup"], timesteps=[500]).gather(0, CPU)[0]
+
+    both, one = gathered(TWO_VALLEYS), gathered(ExactPrior())
+    assert (both.word, one.word) == ("2 minima", "1 minimum")
+    assert both.landscape.energy.shape == (16, 30)
+    assert gathered(ExactPrior(stiffness=0.0)).word == "plateau"  # nothing to tell anywhere
+
+
+def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
+    figure = TrajectoriesFigure(data, ExactPrior(), "cup", 1, 2, steps=40, views=3, timesteps=[500])
+    contents = figure.gather(0, CPU)
+    assert contents.trajectories.shape == (4, 41, 3) and contents.steps == [0, 10, 40]
+    np.testing.assert_allclose(np.degrees(contents.trajectories[:, 0, 1]) % 360, [0, 90, 180, 270], atol=1e-3)
+    assert [row.start for row in contents.rows] == ["0°", "90°", "180°", "270°"]
+    # An image of this prior holds its pose in the first three numbers: the views' are those of the trajectory.
+    shown = shown_pairs(data, ["cup"], [(1, 2)], CPU)
+    pose = shown.pairs.images[shown.pairs.reference][0].flatten()[:3]
+    for row, path in zip(contents.rows, contents.trajectories, strict=True):
+        generated = 2 * row.views.transpose(0, 3, 1, 2).reshape(3, -1)[:, :3] - 1
+        np.testing.assert_allclose(generated, np.clip(pose.numpy() + path[contents.steps], -1, 1), atol=1e-5)
+
+
+def test_generated_views_share_their_draws():
+    class Noisy(ExactPrior):
+        def generate(self, source, pose, steps=50, guidance=3.0, generator=None, eta=1.0):
+            noise = torch.rand(len(pose), 3, 8, 8, generator=generator)
+            return noise + pose[:, 1, None, None, None]
+
+    prior = Noisy()
+    poses = torch.tensor([[0.0, 0.0, 0.0], [0.0, -0.5, 0.0]])
+    views = generated_views(prior, prior.encode(PAIRS.images[:1]), poses, 5, 1.0, seed=4)
+    np.testing.assert_allclose(views[0] - views[1], 0.25, atol=1e-6)
+
+
+# ---------------------------------------------------------------- cameras
+
+
+def test_a_camera_panel_has_every_camera():
+    poses = VIEWS.double().numpy()
+    predicted = np.repeat(poses[1:, None], 2, axis=1) + 0.1
+    wild = predicted.copy()
+    wild[0, 1] = math.nan  # a start that failed
+    images = np.zeros((4, 8, 8, 3), np.uint8)
+    scene = CameraScene("cup", images, poses, np.zeros((8, 8, 4), np.uint8), [predicted, wild], ["", ""])
+    figure = camera_methods_figure([scene, scene], ["one", "other"], math.radians(49))
+    counted = [
+        {
+            kind: [each for each in axes.collections if each.get_gid() == kind]
+            for kind in ("reference", "true", "predicted")
+        }
+        for axes in figure.axes
+        if any(each.get_gid() == "reference" for each in axes.collections)
+    ]
+    numbers = [tuple(len(each) for each in panel.values()) for panel in counted]
+    assert numbers == [(1, 3, 6), (1, 3, 5)] * 2
+    bold, thin = (counted[0][kind][0].get_linewidth()[0] for kind in ("true", "predicted"))
+    assert bold > 2 * thin
+    assert colour_of(0) == RED and len({colour_of(index) for index in range(6)}) == 6
+
+
+def test_predicted_cameras_stand_where_the_solver_says(data):
+    figure = CamerasFigure(data, ExactPrior(), ["cup", "tram"], targets=3, methods=["ifusion"], starts=2)
+    contents = figure.gather(0, CPU)
+    assert [scene.title for scene in contents.scenes] == ["cup", "tram"] and contents.methods == ["iFusion"]
+    places = [(0, 1), (0, 2), (0, 3)]
+    shown = shown_pairs(data, ["cup"] * 3 + ["tram"] * 3, places * 2, CPU)
+    solution = figure.solvers["ifusion"].solve(shown.pairs, figure.starts.make(shown.pairs.ids, 0), 0)
+    cameras = apply_relative_pose(shown.poses[:, :1], solution.poses.detach().double()).numpy()
+    for number, scene in enumerate(contents.scenes):
+        np.testing.assert_allclose(scene.predicted[0], cameras[3 * number : 3 * number + 3], atol=1e-6)
+        np.testing.assert_allclose(scene.poses[1:], shown.poses[3 * number : 3 * number + 3, 1].numpy())
+        assert scene.images.shape == (4, 16, 16, 3) and scene.words[0].endswith("of 6 within 15°")
+
+
+# ---------------------------------------------------------------- views from the mesh
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    """Two boxes with coloured sides, rendered small."""
+    folder = tmp_path_factory.mktemp("meshes")
+    (folder / "boxes").mkdir()
+    box = trimesh.creation.box((1.0, 0.7, 0.4))
+    box.visual.face_colors = np.random.default_rng(0).integers(0, 255, (12, 3)).repeat(1, axis=0)
+    for name in ("box", "crate"):
+        box.export(folder / "boxes" / f"{name}.ply")
+    data = MeshData(
+        RaycastRenderer(), str(folder / "boxes"), str(folder / "views"), resolution=64, test_views=2, workers=1,
+        latitude_step_degrees=60, longitude_step_degrees=180, cache=str(folder / "cache"), image_size=64,
+    )  # fmt: skip
+    data.evaluate_on("ordered", 0)
+    data.prepare_data()
+    return data
+
+
+def test_a_rendered_view_at_the_references_own_pose_is_the_reference(meshes):
+    figure = FailuresFigure(meshes, TWO_VALLEYS, ["box"], views=4, timesteps=[500])
+    contents = figure.gather(0, CPU)
+    assert contents.longitudes_degrees == [0, 90, 180, 270]
+    row = contents.rows[0]
+    assert row.rendered is not None and row.rendered.shape == (4, 256, 256, 3) and len(row.generated) == 4
+    small = row.rendered[0].reshape(64, 4, 64, 4, 3).mean(axis=(1, 3))
+    assert np.abs(small - row.reference / 255).mean() < 0.01
+    assert np.abs(row.rendered[1] - row.rendered[0]).mean() > 0.02
+    # Half a turn around is the reference's pose again, half a turn on.
+    pose = shown_pairs(meshes, ["box"], [(0, 1)], CPU).poses[0, :1]
+    turned = figure.rendered("box", pose + torch.tensor([0.0, math.pi, 0.0]))
+    assert turned is not None
+    np.testing.assert_allclose(turned[0], row.rendered[2], atol=1 / 255)
+
+
+def test_without_a_mesh_there_is_only_what_the_prior_generates(data):
+    contents = FailuresFigure(data, TWO_VALLEYS, ["vase"], views=3, timesteps=[500]).gather(0, CPU)
+    assert contents.rows[0].rendered is None
+    image, views = np.zeros((8, 8, 3)), np.zeros((3, 8, 8, 3))
+    slope = Landscape(*landscape_grid(), 0.0, torch.linspace(0, 1, 480).view(16, 30))
+    row = FailureRow("vase", image, image, None, views, slope, np.zeros(3))
+    bare = failures_figure([row], [0, 120, 240])
+    both = failures_figure([row._replace(rendered=views)], [0, 120, 240])
+    assert len(both.axes) == len(bare.axes) + 3
+
+
+# ---------------------------------------------------------------- the command
+
+PRIOR = """
+    import math
+
+    from exact_prior import ExactPrior
+
+    from lp_framework.registry import register
+
+
+    @register("prior", "tmp_valleys")
+    class Valleys(ExactPrior):
+        "Two valleys."
+
+        def __init__(self) -> None:
+            super().__init__((0.0, math.pi), (0.0, 0.3))
+"""
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory):
+    """A working folder with tiny views, the prior above, and a score and an energy model that have trained a little."""
+    commands = Commands(tmp_path_factory.mktemp("figures"))
+    (commands.folder / "plugins" / "tmp_tiny_valleys").mkdir()
+    (commands.folder / "plugins" / "tmp_tiny_valleys" / "tmp_tiny_valleys.py").write_text(textwrap.dedent(PRIOR))
+    for model in ("score", "energy"):
+        ran = commands.here(model, "train", f"model={model}", "trainer.max_epochs=1")
+        assert ran.status == 0, ran.err
+    return commands
+
+
+def write_starts(folder: Path) -> Path:
+    for solver in ("ifusion", "two_stage"):
+        for count in (2, 4):
+            config = {"solver.name": solver, "start.name": "random", "start.count": count}
+            write_result(folder / f"{solver}{count}", config, metrics(0.5 + 0.1 * count), experiment="starts")
+    return folder
+
+
+SMALL = {
+    "landscapes": ["figure.objects=[cup,vase,tram]", "figure.longitude_step_degrees=30", "figure.timesteps=[500]"],
+    "trajectories": ["figure.object=tram", "figure.steps=3", "figure.timesteps=[500]"],
+    "toy": ["figure.object=tram", "figure.score=score", "figure.energy=energy", "figure.timesteps=[500]"],
+    "cameras": ["figure.objects=[cup,tram]", "figure.targets=2", "figure.score=score"],
+    "recall": ["figure.runs=starts"],
+    "score_vs_energy": ["figure.objects=[cup,mug]", "figure.score=score", "figure.energy=energy"],
+    "failures": ["figure.objects=[vase]", "figure.views=3", "figure.timesteps=[500]"],
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_command_writes_the_figure_and_its_caption(commands, name):
+    if name == "recall":
+        write_starts(commands.folder / "starts")
+    settings = [f"experiment=figure_{name}", "prior=tmp_valleys", *SMALL[name]]
+    ran = commands.here(f"runs/{name}", "figure", *settings)
+    assert ran.status == 0, ran.err
+    png, pdf = (ran.folder / f"figure_{name}.{suffix}" for suffix in ("png", "pdf"))
+    with Image.open(png) as picture:
+        assert picture.width >= 1400 and picture.height >= 400  # 7 inches, 200 dots each
+    assert pdf.read_bytes().startswith(b"%PDF")
+    record = json.loads((ran.folder / "figure.json").read_text())
+    assert record["files"] == [png.name, pdf.name] and record["config"]["figure"]["name"] == name
+    assert record["caption"] in ran.out and "None" not in record["caption"] and record["versions"]["torch"]
+
+
+def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
+    from lp_framework import registry
+
+    root = Path(__file__).parents[1]
+    assert sorted(SMALL) == registry.names("figure")
+    described = (root / "docs" / "figures.md").read_text()
+    for name in SMALL:
+        assert (root / "conf" / "experiment" / f"figure_{name}.yaml").is_file()
+        assert f"experiment=figure_{name}" in described
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ["figure=toy"],
+            "needs an energy model, and none ships: train one with `python -m lp_framework train model=en",
+        ),
+        (["figure=toy", "figure.energy=score"], "figure.energy=score: holds a score model, an energy model is wanted"),
+        (["figure=cameras", "figure.score=energy"], "figure.score=energy: holds an energy model, a score model is wan"),
+        (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data have no object 'cap'; did you mean"),
+        (["figure=recall", "figure.runs=none"], "there is no such folder of finished runs; `python -m lp_framework ev"),
+        (["figure=recall", "figure.runs=score"], "no finished runs with several numbers of starts; `python -m lp_fr"),
+        (["figure=landscapes", "figure.timesteps=[1000]"], "figure.timesteps must list some of 0 to 999"),
+        (["figure=landscapes", "figure.noises=0"], "figure.noises must be at least 1, got 0"),
+        (["figure=landscapes", "figure.longitude_step_degrees=50"], "longitude_step_degrees must divide 360"),
+        (["figure=landscapes", "figure.objects=[]"], "figure.objects needs the name of an object"),
+        (["figure=trajectories", "figure.views=9"], "figure.views must be 2 to 5"),
+        (
+            ["figure=cameras", "figure.targets=9", "figure.objects=[cup]"],
+            "object 'cup' has test views 0 to 3, there is",
+        ),
+        (["figure=cameras", "figure.methods=[ifuzion]"], "there is no solver 'ifuzion'; did you mean 'ifusion'"),
+        (["figure=failures", "figure.views=1"], "figure.views must be 2 to 12"),
+    ],
+)
+def test_a_mistake_is_told_in_one_sentence(commands, settings, message):
+    assert message in commands.here("runs/mistake", "figure", "prior=tmp_valleys", *settings).error
