@@ -210,6 +210,16 @@ def test_images_of_another_size_are_resized():
     assert backbone(torch.rand(2, 3, 20, 20)).shape == (2, 6)
 
 
+@pytest.mark.parametrize("at_once", [1, 4, 100])
+def test_how_many_images_pass_a_frozen_trunk_at_once_changes_nothing(at_once, monkeypatch):
+    backbone = Colors()
+    images = torch.rand(9, 3, 8, 8, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    together = backbone.trunk_features(images)
+    monkeypatch.setattr("lp_framework.models.backbones.ON_CPU", at_once)
+    torch.testing.assert_close(backbone.trunk(images), together)
+    assert backbone.trunk(images[:0]).shape == (0, backbone.trunk_dim)
+
+
 def test_a_fingerprint_changes_with_the_trunks_weights_alone():
     backbone = Colors()
     before = backbone.fingerprint()
