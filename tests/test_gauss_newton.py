@@ -212,6 +212,18 @@ def test_a_start_where_the_prior_fails_stops_alone_and_is_reported(what):
     assert solution.chosen[1] != 2
 
 
+def test_the_second_stage_alone_starts_where_the_first_ends():
+    pairs, true = exact_pairs(3)
+    starts = around(true, 0.5, -0.5)
+    both = GaussNewton(ExactModel(), ExactPrior(noisy=0.1), refinement_steps=2)
+    second = both.refine(pairs, both.first.solve(pairs, starts, seed=0).poses, seed=0)
+    whole = both.solve(pairs, starts, seed=0)
+    assert torch.equal(second.poses, whole.poses) and torch.equal(second.energies, whole.energies)
+    assert (
+        second.cost.network_passes == whole.cost.network_passes - both.first.solve(pairs, starts, 0).cost.network_passes
+    )
+
+
 def test_it_works_in_inference_mode():
     with torch.inference_mode():
         pairs, true = exact_pairs(3)

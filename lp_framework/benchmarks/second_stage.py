@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
+from lp_framework.benchmarks.arithmetic import Arithmetic, counted, peak
 from lp_framework.benchmarks.section import Figure, Section, synchronise
 from lp_framework.errors import UserError
 from lp_framework.priors.base import ViewCode
@@ -138,16 +139,16 @@ class SecondStage:
 
     def measure(self) -> Iterator[Section]:
         """The section after every stretch of either contender."""
+        work = self.work()
         batch_prior, loop_prior = self.priors()
-        images = torch.rand(2, 3, 256, 256, device=self.device) * 2 - 1
-        index = torch.arange(2, device=self.device)
+        pair = self.pair()
         began = time.perf_counter()
-        energy = PairEnergy(batch_prior, Pairs(images, index[:1], index[1:], ids=index[:1]), seed=0)
+        energy = PairEnergy(batch_prior, pair, seed=0)
         synchronise(self.device)
         encoding = time.perf_counter() - began
-        ring = {count: Ring(count).make(index[:1], seed=0) for count in self.starts}
+        ring = {count: Ring(count).make(pair.ids, seed=0) for count in self.starts}
         batched = {count: Batched(energy, starts) for count, starts in ring.items()}
-        loops = [PlainLoop(loop_prior, images, start) for start in ring[max(self.starts)][0]]
+        loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(self.starts)][0]]
         self.warm_up(batched, loops[0])
         measured = {count: {BATCHED: Measured(), LOOP: Measured()} for count in self.starts}
         done, total = 0, 2 * self.rounds * sum(self.starts)
@@ -162,15 +163,36 @@ class SecondStage:
                         seconds += stretch / self.steps
                         measured[count][name].peak = max(measured[count][name].peak, peak)
                         done += count // len(runners)
-                        yield self.section(measured, encoding, done / total)
+                        yield self.section(measured, work, encoding, done / total)
                     measured[count][name].seconds.append(seconds)
-                yield self.section(measured, encoding, done / total)
+                yield self.section(measured, work, encoding, done / total)
+
+    def pair(self) -> Pairs:
+        """A pair of random images."""
+        index = torch.arange(2, device=self.device)
+        images = torch.rand(2, 3, 256, 256, device=self.device) * 2 - 1
+        return Pairs(images, index[:1], index[1:], ids=index[:1])
+
+    def work(self) -> dict[str, Arithmetic]:
+        """What a start's step takes of either contender, counted on the meta device: nothing is computed."""
+        meta = replace(self, device=torch.device("meta"), compile=False)
+        batch_prior, loop_prior = meta.priors()
+        pair = meta.pair()
+        batched = Batched(PairEnergy(batch_prior, pair, seed=0), Ring(1).make(pair.ids, seed=0))
+        loop = PlainLoop(loop_prior, pair.images, torch.zeros(3))
+        pose = torch.zeros(3, device=meta.device, requires_grad=True)
+        noise = torch.empty(2, *loop_prior.latent_shape, device=meta.device)
+        return {
+            BATCHED: Arithmetic(counted(batched.step), peak(self.device, DTYPES[self.dtype])),
+            LOOP: Arithmetic(counted(lambda: loop.loss(pose, noise).backward()), peak(self.device, torch.float32)),
+        }
 
     def priors(self) -> tuple[Zero123Prior, Zero123Prior]:
         """The same random weights for the batch and for the loop; they share memory where nothing converts them."""
         from diffusers.models.attention_processor import AttnProcessor
 
-        networks = Networks(ARCHITECTURES[self.architecture]).to(self.device)
+        with self.device:
+            networks = Networks(ARCHITECTURES[self.architecture])
         # New parameters around the same storage: a conversion of one does not reach the other.
         shared: dict[int, Any] = {id(each): nn.Parameter(each.detach(), False) for each in networks.parameters()}
         loop = Zero123Prior(copy.deepcopy(networks, shared)).to(self.device)
@@ -203,7 +225,13 @@ class SecondStage:
         weights = sum(each.nbytes for each in prior.parameters())
         return seconds, torch.cuda.max_memory_allocated(self.device) - before + weights
 
-    def section(self, measured: Mapping[int, Mapping[str, Measured]], encoding: float, done: float) -> Section:
+    def section(
+        self,
+        measured: Mapping[int, Mapping[str, Measured]],
+        work: Mapping[str, Arithmetic],
+        encoding: float,
+        done: float,
+    ) -> Section:
         """The figures of those numbers of starts that both contenders have gone through."""
         figures: list[Figure] = []
         record: dict[str, Any] = {}
@@ -211,15 +239,18 @@ class SecondStage:
             entry: dict[str, Any] = {}
             for name, one in both.items():
                 if one.seconds:
-                    entry[name] = {"seconds_per_step": median(one.seconds), "rounds": list(one.seconds)}
+                    seconds = median(one.seconds)
+                    share = count * work[name].share(seconds)
+                    entry[name] = {"seconds_per_step": seconds, "rounds": list(one.seconds), "share_of_peak": share}
                     entry[name] |= {"peak_bytes": one.peak} if one.peak else {}
             if len(entry) == 2:
                 label = f"{count} start{'s' if count > 1 else ''}"
                 rows = [Figure(f"{label}, seconds a step", *(median(one.seconds) for one in both.values()))]
+                rows.append(Figure(f"{label}, share of peak", *(entry[name]["share_of_peak"] for name in both)))
                 if both[LOOP].peak:
                     rows.append(Figure(f"{label}, peak memory, GB", *(one.peak / 1e9 for one in both.values())))
                 entry["ratio"] = {"seconds_per_step": rows[0].ratio}
-                entry["ratio"] |= {"peak_bytes": rows[1].ratio} if both[LOOP].peak else {}
+                entry["ratio"] |= {"peak_bytes": rows[2].ratio} if both[LOOP].peak else {}
                 figures += rows
             if entry:
                 record[str(count)] = entry
@@ -227,8 +258,13 @@ class SecondStage:
             "second stage: a step of one pair",
             (BATCHED, LOOP),
             figures,
-            {"starts": record, "encoding_seconds": encoding},
+            {
+                "starts": record,
+                "encoding_seconds": encoding,
+                "arithmetic_per_start": {name: one.record() for name, one in work.items()},
+            },
             done,
             f"Zero123's {self.architecture} size, random weights. {BATCHED}: all starts and both directions together, "
-            f"images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images encoded each step",
+            f"images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images anew each step; "
+            + "; ".join(f"{name}: a start's step is {one}" for name, one in work.items()),
         )

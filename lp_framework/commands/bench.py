@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import typing
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -14,14 +15,29 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from lp_framework import registry
-from lp_framework.benchmarks import loader, second_stage
+from lp_framework.benchmarks import (
+    adam_gauss_newton,
+    checkpoint,
+    encoding,
+    first_stage,
+    loader,
+    precision,
+    rendering,
+    scaling,
+    second_stage,
+)
 from lp_framework.benchmarks.section import Section
 from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
+from lp_framework.data.pairs import PairData
+from lp_framework.data.toy import toy_objects
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
+from lp_framework.models.checkpoints import SHIPPED, load_model
+from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.zero123.attention import Attention
 from lp_framework.priors.zero123.networks import Dtype, require_packages
+from lp_framework.solvers.starts import Ring
 
 RESULT = "bench.json"
 
@@ -58,31 +74,115 @@ def run(config: DictConfig) -> None:
     console.print(f"results: {folder / RESULT}", soft_wrap=True)
 
 
+# ---------------------------------------------------------------- the measurements, with what they need of the config
+
+
 def _loader(config: DictConfig, device: torch.device) -> Iterator[Section]:
-    settings = config.loader
-    _check_counts("loader", settings)
-    data = build_data(config)
-    data.prepare_data()
-    backbone = registry.build("backbone", config.backbone)
-    model = registry.build("model", config.model, backbone=backbone)
+    settings = _settings(config, "loader", "rounds", "steps")
+    data, model = _training(config)
     batch, block = config.data.batch_pairs, config.data.block
-    note = f"{config.backbone.get('arch', config.backbone.name)} at {backbone.image_size} px, {batch} pairs a batch"
-    return loader.measure(data.data("train"), model, batch, block, settings.rounds, settings.steps, device, note)
+    return loader.measure(data, model, batch, block, **settings, device=device, note=_training_note(config, model))
+
+
+def _encoding(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "encoding", "rounds")
+    data, model = _training(config)
+    prior = registry.build("prior", config.prior)
+    batch, block = config.data.batch_pairs, config.data.block
+    note = f"{_training_note(config, model)}; prior={config.prior.name}"
+    return encoding.measure(data, model, prior, batch, block, **settings, device=device, note=note)
+
+
+def _first_stage(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "first_stage", "views", "starts", "rounds")
+    if settings["views"] < 2:
+        raise UserError(f"first_stage.views must be at least 2, got {settings['views']}")
+    return first_stage.measure(_pose_model(), **settings, device=device)
 
 
 def _second_stage(config: DictConfig, device: torch.device) -> Iterator[Section]:
-    settings = plain(config.second_stage)
-    _check_counts("second_stage", settings)
+    settings = _settings(config, "second_stage", "rounds", "steps")
     for key, kind in (("architecture", second_stage.Architecture), ("dtype", Dtype), ("attention", Attention)):
         _check_choice(f"second_stage.{key}", settings[key], typing.get_args(kind))
     require_packages()
     return second_stage.SecondStage(device, **settings).measure()
 
 
+def _precision(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "precision", "starts", "rounds", "steps")
+    _check_choice("precision.architecture", settings["architecture"], typing.get_args(second_stage.Architecture))
+    require_packages()
+    return precision.Precision(device, **settings).measure()
+
+
+def _adam_gauss_newton(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "adam_gauss_newton", "pairs", "starts", "newton_steps", "adam_steps", "rounds")
+    data = build_data(config)
+    data.evaluate_on("ordered", 0)
+    data.prepare_data()
+    prior = registry.build("prior", config.prior)
+    views, count = data.data("test"), settings.pop("pairs")
+    starts = Ring(settings.pop("starts"))
+    pairs = adam_gauss_newton.some_pairs(views, count, device)
+    note = f"{len(pairs)} pairs of {config.data.name}'s test views, {starts.count} starts, prior={config.prior.name}"
+    poses = starts.make(pairs.ids, seed=0)
+    return adam_gauss_newton.measure(pairs, poses, _pose_model(), prior, **settings, device=device, note=note)
+
+
+def _rendering(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "rendering", "views", "resolution", "rounds")
+    objects = {obj.name: obj for obj in toy_objects()}
+    _check_choice("rendering.object", settings["object"], objects)
+    obj = objects[settings.pop("object")]
+    names = [name for name in registry.names("renderer") if name != "auto"]  # which is one of the others
+    renderers = {name: registry.build("renderer", {"name": name}) for name in names}
+    return rendering.measure(obj, renderers, **settings, device=device)
+
+
+def _checkpoint(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "checkpoint", "rounds")
+    _check_choice("checkpoint.architecture", settings["architecture"], typing.get_args(second_stage.Architecture))
+    for dtype in settings["dtypes"]:
+        _check_choice("checkpoint.dtypes", dtype, typing.get_args(Dtype))
+    require_packages()
+    return checkpoint.measure(**settings, device=device, place=run_folder())
+
+
+def _scaling(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "scaling", "steps", "rounds")
+    prior = registry.build("prior", config.prior)
+    return scaling.Scaling(device, _pose_model(), prior, **settings).measure()
+
+
 MEASUREMENTS: dict[str, Callable[[DictConfig, torch.device], Iterator[Section]]] = {
     "loader": _loader,
+    "encoding": _encoding,
+    "first_stage": _first_stage,
     "second_stage": _second_stage,
+    "precision": _precision,
+    "adam_gauss_newton": _adam_gauss_newton,
+    "rendering": _rendering,
+    "checkpoint": _checkpoint,
+    "scaling": _scaling,
 }
+
+
+def _training(config: DictConfig) -> tuple[PairData, PoseModel]:
+    """Training views, and a new model on the chosen backbone."""
+    data = build_data(config)
+    data.prepare_data()
+    backbone = registry.build("backbone", config.backbone)
+    return data.data("train"), registry.build("model", config.model, backbone=backbone)
+
+
+def _training_note(config: DictConfig, model: PoseModel) -> str:
+    arch = config.backbone.get("arch", config.backbone.name)
+    return f"{arch} at {model.backbone.image_size} px, {config.data.batch_pairs} pairs a batch"
+
+
+def _pose_model() -> PoseModel:
+    """The one that ships: figures are to be compared, whatever has been trained here."""
+    return load_model(SHIPPED / "score")
 
 
 def table(sections: Sequence[Section]) -> Table:
@@ -109,11 +209,14 @@ def _progress() -> Progress:
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
-def _check_counts(section: str, settings: DictConfig | dict[str, object]) -> None:
-    for key in ("rounds", "steps"):
+def _settings(config: DictConfig, section: str, *counts: str) -> dict[str, Any]:
+    """The settings of a measurement; those named `counts` must be at least 1."""
+    settings = plain(config[section])
+    for key in counts:
         value = settings[key]
         if not isinstance(value, int) or value < 1:
             raise UserError(f"{section}.{key} must be at least 1, got {value}")
+    return settings
 
 
 def _check_choice(key: str, value: object, known: typing.Iterable[str]) -> None:

@@ -74,16 +74,33 @@ class GaussNewton(Solver):
         self.steps, self.timesteps, self.damping = refinement_steps, list(timesteps), damping
         self.trajectory = trajectory
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. Energies are those descended; a start is invalid when the model or the prior failed."""
+        first = self.first.solve(pairs, starts, seed)
+        # A start that failed goes along at the origin, so that the others stay in their places.
+        second = self.refine(pairs, first.poses.masked_fill(~first.valid[..., None], 0.0), seed)
+        energies = second.energies.masked_fill(~first.valid, torch.nan)
+        trajectory = None
+        if first.trajectory is not None and second.trajectory is not None:
+            trajectory = torch.cat([first.trajectory, second.trajectory[:, :, 1:]], dim=2)
+        return Solution(
+            poses=torch.where(first.valid[..., None], second.poses, first.poses),
+            energies=energies,
+            valid=first.valid & second.valid,
+            chosen=choose(energies),
+            cost=Cost(first.cost.network_passes + second.cost.network_passes, first.cost.seconds + second.cost.seconds),
+            trajectory=trajectory,
+        )
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def refine(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        """The second stage alone, from starts `[B, N, 3]`."""
         check_starts(pairs, starts)
         began = time.perf_counter()
-        first = self.first.solve(pairs, starts, seed)
         energy = PairEnergy(self.prior, pairs, seed)
         noise = energy.noise(0, len(self.timesteps))
-        pose = _plausible(first.poses)
+        pose = _plausible(starts.clone())
         path = [pose]
         here = self._quadratic(energy, pose, noise)
         damping = self.damping * here.hessian.diagonal(dim1=-2, dim2=-1).amax(dim=-1)  # [B, N]
@@ -109,20 +126,17 @@ class GaussNewton(Solver):
                 torch.where(better[..., None, None], there.hessian, here.hessian),
             )
             path.append(pose)
-        valid = first.valid & here.energy.isfinite() & here.gradient.isfinite().all(dim=-1)
+        valid = here.energy.isfinite() & here.gradient.isfinite().all(dim=-1)
         energies = here.energy.masked_fill(~valid, torch.nan)
         reduced = pose.clone()
         reduced[..., 1] = wrap_angle(pose[..., 1]) % (2 * math.pi)
-        trajectory = None
-        if first.trajectory is not None:
-            trajectory = torch.cat([first.trajectory, torch.stack(path[1:], dim=2)], dim=2)
         return Solution(
             poses=reduced,
             energies=energies,
             valid=valid,
             chosen=choose(energies),
-            cost=Cost(first.cost.network_passes + energy.passes, time.perf_counter() - began),
-            trajectory=trajectory,
+            cost=Cost(energy.passes, time.perf_counter() - began),
+            trajectory=torch.stack(path, dim=2) if self.trajectory else None,
         )
 
     def _quadratic(self, energy: PairEnergy, pose: Tensor, noise: Tensor) -> Quadratic:
