@@ -72,6 +72,18 @@ def test_the_relief_tells_objects_without_an_answer(landscape):
     assert max(relief[False]) < 0.2 * min(relief[True])
 
 
+def test_the_ambiguity_score_knows_the_classes(landscape):
+    """Unlike the classes it goes by what the prior sees: some shapes without symmetry look alike from behind."""
+    for row in landscape["objects"]:
+        score = row["ambiguity_score"]
+        assert score["unique_answer"] == row["unique_answer"], row["object"]
+        assert (score["verdict"] == "continuous") == (not row["unique_answer"]), row["object"]
+        assert row["ambiguity"] != "twofold" or score["verdict"] == "twofold", row["object"]
+        assert score["flatness"] > 0.98 if score["verdict"] == "continuous" else score["flatness"] < 0.75
+    verdicts = {row["object"]: row["ambiguity_score"]["verdict"] for row in landscape["objects"]}
+    assert {verdicts[name] for name in ("duck", "robot", "watering_can")} == {"unique"}
+
+
 @pytest.mark.parametrize("name", ["duck", "fire_engine", "tram"])
 def test_generated_views_look_like_the_object_from_there(landscape, folder, name):
     """A view generated for the pose of each test view is nearest to that view, of all of them."""

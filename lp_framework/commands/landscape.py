@@ -1,8 +1,10 @@
-"""`landscape`: the prior's energy around each object of a data set, and whether its least is at the truth."""
+"""`landscape`: the prior's energy over relative poses, of a pair of views or around each object of a data set."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,29 +12,60 @@ from omegaconf import DictConfig
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from lp_framework import registry
+from lp_framework.commands import pair_landscape
 from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.cache import tracked
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import ViewTable
 from lp_framework.errors import UserError
+from lp_framework.evaluation.ambiguity import Ambiguity, ambiguity
 from lp_framework.evaluation.azimuth import NEAR_DEGREES, Profile, azimuth_energies, profile, within
+from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs
 from lp_framework.viz.azimuth import AzimuthPanel, azimuth_figure
+from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.style import save_figure
+
+PAIRS = 8  # an object, for its ambiguity
 
 
 @orderly_console()
 @torch.no_grad()
 def run(config: DictConfig) -> None:
-    """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
-    if config.azimuths < 2 or config.noises < 1 or not config.timesteps:
-        raise UserError("azimuths must be at least 2, noises at least 1, and timesteps need one number")
+    """The landscape of a pair of views where one is named, else the overview of all objects."""
+    check(config)
     folder = run_folder()
     seed_run(config.seed)
+    if config.object is not None or config.images is not None:
+        pair_landscape.run(config, folder)
+    else:
+        overview(config, folder)
+
+
+def check(config: DictConfig) -> None:
+    """`UserError` for settings that no landscape has."""
+    for key, least in (("azimuths", 2), ("noises", 1), ("batch", 1)):
+        if not isinstance(config[key], int) or config[key] < least:
+            raise UserError(f"{key} must be a whole number, at least {least}, got {config[key]}")
+    for key in ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degrees"):
+        if not isinstance(config[key], int | float):
+            raise UserError(f"{key} must be a number, got {config[key]}")
+    steps = list(config.timesteps) if isinstance(config.timesteps, Sequence) else []
+    if not steps or not all(isinstance(each, int) for each in steps):
+        raise UserError(f"timesteps must list whole numbers, one at least, got {config.timesteps}")
+    if config.object is not None and config.images is not None:
+        raise UserError("give object=NAME for views of the data set or images=[A.png,B.png], not both")
+
+
+def overview(config: DictConfig, folder: Path) -> None:
+    """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
+    grid = landscape_grid(config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees)
     device = choose_device(config.accelerator)
     prior: Prior = registry.build("prior", config.prior).to(device)
     data = build_data(config)
@@ -48,12 +81,14 @@ def run(config: DictConfig) -> None:
         poses = batch.relative_poses()
         energies.append(
             azimuth_energies(
-                prior, pairs, poses.to(device), azimuths, config.timesteps, config.noises, config.seed
+                prior, pairs, poses.to(device), azimuths, config.timesteps, config.noises, config.seed, config.batch
             ).cpu()
         )
         truth.append(poses[:, 1])
         objects.append(batch.objects[batch.reference])
     rows = summarise(table, torch.cat(energies), azimuths, torch.cat(truth), torch.cat(objects))
+    for row, score in zip(rows, ambiguities(config, data, prior, grid), strict=True):
+        row["ambiguity_score"] = score.record()
     record = {"objects": rows, **overall(rows), "config": plain(config), "versions": versions()}
     write_json(folder / "azimuth.json", record)
     panels = [
@@ -62,12 +97,36 @@ def run(config: DictConfig) -> None:
     pictures = save_figure(azimuth_figure(panels), folder / "azimuth")
     console = Console(width=None if Console().is_terminal else 110, highlight=False)
     console.print(terminal_table(f"{config.data.name}, prior={config.prior.name}", rows, record))
+    if unanswered := [row["object"] for row in rows if not row["ambiguity_score"]["unique_answer"]]:
+        console.print(f"without a unique answer to this prior: {', '.join(unanswered)}", soft_wrap=True)
     console.print(f"results: {folder / 'azimuth.json'}", soft_wrap=True)
     console.print(f"picture: {pictures[0]}", soft_wrap=True)
+    console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
+
+
+def ambiguities(config: DictConfig, data: PairDataModule, prior: Prior, grid: tuple[Tensor, Tensor]) -> list[Ambiguity]:
+    """The ambiguity of every object, by the landscapes of up to `PAIRS` pairs of the protocol `per_view`."""
+    device = choose_device(config.accelerator)
+    split = data.evaluation_split()
+    table, batches = data.table(split), data.data(split)
+    pairs = table.pairs("per_view", config.seed)  # a row a view
+    found = []
+    for index in tracked(range(len(table.names)), "ambiguity of the objects"):
+        batch = batches[pairs[table.views_of(index)[:PAIRS]]]
+        assert batch.images is not None  # nothing caches features here
+        ids = table.pair_ids(batch.pairs)
+        own = Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
+        truth = batch.relative_poses()
+        energies = prior_landscapes(
+            prior, own, truth[:, 2], *grid, config.timesteps, config.noises, config.seed, config.batch
+        ).cpu()
+        radii = truth[:, 2].tolist()
+        found.append(ambiguity([Landscape(*grid, *each) for each in zip(radii, energies, strict=True)], truth[:, 1]))
+    return found
 
 
 def summarise(
-    table: ViewTable, energies: torch.Tensor, azimuths: torch.Tensor, truth: torch.Tensor, objects: torch.Tensor
+    table: ViewTable, energies: Tensor, azimuths: Tensor, truth: Tensor, objects: Tensor
 ) -> list[dict[str, Any]]:
     """A row an object: its share of pairs `within` the limit, its profile and the minima of that."""
     near = within(energies, azimuths, truth)
@@ -103,10 +162,16 @@ def terminal_table(title: str, rows: list[dict[str, Any]], record: dict[str, Any
     table.add_column("class", no_wrap=True)
     table.add_column(f"within {NEAR_DEGREES:g}°", justify="right")
     table.add_column("relief", justify="right")
-    table.add_column("minima (degrees from the truth: height)", no_wrap=True)
+    table.add_column("minima (degrees from truth: height)", no_wrap=True)
+    table.add_column("flatness", justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
     for row in sorted(rows, key=lambda row: -row["within"]):
         minima = ", ".join(f"{minimum['degrees']:+.0f}: {minimum['height']:.2f}" for minimum in row["minima"][:4])
-        table.add_row(row["object"], row["ambiguity"], f"{row['within']:.2f}", f"{row['relief']:.1%}", minima)
+        score = row["ambiguity_score"]
+        table.add_row(
+            row["object"], row["ambiguity"], f"{row['within']:.2f}", f"{row['relief']:.1%}", minima,
+            f"{score['flatness']:.2f}", score["verdict"],
+        )  # fmt: skip
     table.add_section()
     for name, key in (("all objects", "within"), ("unique answer", "within_unique_answer")):
         if record[key] is not None:

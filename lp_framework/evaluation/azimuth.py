@@ -13,28 +13,32 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lp_framework.evaluation.landscape import BATCH, pose_energies
 from lp_framework.geometry import wrap_angle
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.pair_energy import PairEnergy
 
 NEAR_DEGREES = 15.0
 PROMINENCE = 0.1  # of the profile's range; a shallower dent is no minimum
 
 
-@torch.no_grad()
 def azimuth_energies(
-    prior: Prior, pairs: Pairs, poses: Tensor, azimuths: Tensor, timesteps: Sequence[int], noises: int, seed: int
+    prior: Prior,
+    pairs: Pairs,
+    poses: Tensor,
+    azimuths: Tensor,
+    timesteps: Sequence[int],
+    noises: int,
+    seed: int,
+    batch: int = BATCH,
 ) -> Tensor:
     """Energies `[B, A]` at the relative longitudes `azimuths` `[A]` (radians), for B pairs of true `poses` `[B, 3]`.
 
-    The mean over timesteps, over `noises` noises each and over both directions; latitude and radius are the true ones.
+    As `prior_landscapes`, but latitude and radius are the true ones.
     """
-    energy = PairEnergy(prior, pairs, seed)
     around = poses[:, None].repeat(1, len(azimuths), 1)
     around[..., 1] = azimuths.to(poses)
-    steps = [timestep for timestep in timesteps for _ in range(noises)]
-    return energy.mean(around, steps, energy.noise(0, count=len(steps)))
+    return pose_energies(prior, pairs, around, timesteps, noises, seed, batch)
 
 
 class Minimum(NamedTuple):
