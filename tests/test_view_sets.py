@@ -77,9 +77,8 @@ def test_sets_of_all_views_have_all_ordered_pairs(data):
     assert found == {tuple(pair) for pair in data.table("test").pairs("ordered").tolist()}
 
 
-def test_a_batch_holds_whole_sets(data, monkeypatch):
-    monkeypatch.setattr("lp_framework.data.module.EVALUATION_PAIRS", 10)
-    data.evaluate_on_sets(4)
+def test_a_batch_holds_whole_sets(data):
+    data.evaluate_on_sets(4, batch_pairs=10)
     data.prepare_data()
     batches = list(data.test_dataloader())
     assert [len(batch) for batch in batches] == [9, 9, 9, 3]  # three sets of three pairs, not ten pairs

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import logging
 import platform
 import subprocess
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning import Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 from lp_framework import registry
 from lp_framework.composition import one_line
@@ -37,6 +40,7 @@ OF_NO_USE = (
     r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk
     r"Experiment logs directory .* exists and is not empty",  # it is the run's folder
     r"Checkpoint directory .* exists and is not empty",
+    r"Total length of `DataLoader` across ranks is zero",  # an evaluation of which only the tables were missing
 )
 
 
@@ -70,16 +74,18 @@ def build_data(config: DictConfig) -> PairDataModule:
     return data
 
 
-def build_solver(config: DictConfig) -> tuple[Solver, Path | None]:
+def build_solver(config: DictConfig, known: Path | None = None) -> tuple[Solver, Path | None]:
     """The solver of a config and the checkpoint of its model, with those of model and prior that it asks for.
 
-    The model is that of `config.checkpoint`, else the latest training run's, else the one that ships.
+    The model is that of the checkpoint `known`, else `config.checkpoint`, else the latest training run's, else the one
+    that ships.
     """
     wanted = registry.component_names(registry.get("solver", config.solver.name))
     components: dict[str, Any] = {}
     checkpoint: Path | None = None
     if "model" in wanted:
-        checkpoint = default_checkpoint() if config.checkpoint is None else find_checkpoint(config.checkpoint)
+        chosen = config.checkpoint if known is None else known
+        checkpoint = default_checkpoint() if chosen is None else find_checkpoint(chosen)
         components["model"] = load_model(checkpoint)
     if "prior" in wanted:
         components["prior"] = registry.build("prior", config.prior)
@@ -123,8 +129,22 @@ def plain(config: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
+def weights_fingerprint(networks: Sequence[nn.Module], sample: int = 1024) -> str:
+    """A text that changes when networks do: of every parameter and buffer its name, shape and first values.
+
+    Training changes every tensor, so a `sample` of each tells; of large networks all of it would take long to read.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for network in networks:
+        for name, value in network.state_dict().items():
+            digest.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
+            values = value.detach().flatten()[:sample].cpu().contiguous()
+            digest.update(values.view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
 def versions() -> dict[str, str]:
-    """Versions of what computes, and the state of the source tree where there is one."""
+    """Versions of what computes, and the commit of the source tree where there is one, `-dirty` if it was changed."""
     packages = ("lp_framework", "torch", "torchvision", "lightning", "numpy", "trimesh", "pyrender")
     found = {name: importlib.metadata.version(name) for name in packages}
     return {"python": platform.python_version(), **found, "git": _git_state()}
@@ -135,7 +155,7 @@ def _git_state() -> str:
     if not (here / ".git").exists():
         return "not a checkout"
     try:
-        command = ["git", "-C", str(here), "describe", "--always", "--dirty"]
+        command = ["git", "-C", str(here), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty"]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"

@@ -1,7 +1,16 @@
-"""`eval`: a solver on a data set's test views, as a table in the paper's layout, JSON and CSV."""
+"""`eval`: a solver on a data set's test views, as a table in the paper's layout, JSON and CSV.
+
+A run that was stopped goes on with `resume=RUN_FOLDER`, or where the same command is given the same folder.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import RichProgressBar
 from omegaconf import DictConfig
 from rich.console import Console
@@ -16,52 +25,96 @@ from lp_framework.commands.building import (
     run_folder,
     seed_run,
     versions,
+    weights_fingerprint,
 )
-from lp_framework.commands.finished import is_finished
+from lp_framework.commands.finished import is_finished, unfinished_evaluation
+from lp_framework.data.module import EVALUATION_PAIRS, PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.journal import Journal, goes_on, unfinished
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.evaluation.view_sets import ViewSetEvaluation
+from lp_framework.solvers.base import Solver
+from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.pictures import save_pictures, save_summaries
+
+LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and many would be long unsaved
+LARGE_PAIRS = 4  # pairs a batch with networks that are large
 
 
 @orderly_console()
 def run(config: DictConfig) -> None:
-    """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder."""
-    folder = run_folder()
-    if is_finished(folder, config):
+    """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder.
+
+    With `resume` it is the folder of an evaluation that was stopped.
+    """
+    folder, known = run_folder(), None
+    if config.resume is not None:
+        folder = Path(config.resume)
+        config, known = unfinished_evaluation(folder, config, HydraConfig.get().overrides.task)
+    elif is_finished(folder, config):
         return
     seed_run(config.seed)
-    solver, checkpoint = build_solver(config)
-    starts = registry.build("start", config.start)
+    solver, checkpoint = build_solver(config, known)
+    subject = {
+        "config": json.loads(json.dumps(plain(config))),
+        "checkpoint": str(checkpoint) if checkpoint else None,
+        "weights": weights_fingerprint(solver.networks()),
+        "versions": versions(),
+    }
+    before = unfinished(folder) if goes_on(folder, subject) else None
+    journal = Journal(folder, subject)
     data = build_data(config)
     trainer = build_trainer(config, folder, [RichProgressBar(leave=False)], logger=[])
-    protocol, saved = config.protocol, save_pictures
-    if config.views is None:
-        data.evaluate_on(protocol, config.seed)
-        evaluation = Evaluation(solver, starts, config.seed)
-    else:
-        if protocol != "ordered":
-            raise UserError(f"protocol={protocol} is one of pairs; views={config.views} has its own, leave it out")
-        protocol, saved = "view_sets", save_summaries
-        data.evaluate_on_sets(config.views)
-        evaluation = ViewSetEvaluation(solver, starts, config.seed, config.views)
+    evaluation = build_evaluation(config, solver, data, journal)
     trainer.test(evaluation, datamodule=data, verbose=False)
     result = {
         **evaluation.result(),
-        "protocol": protocol,
+        "protocol": config.protocol if config.views is None else "view_sets",
         "seed": config.seed,
-        "checkpoint": str(checkpoint) if checkpoint else None,
+        "checkpoint": subject["checkpoint"],
+        "fingerprints": {"weights": subject["weights"], "views": data.fingerprint(data.evaluation_split())},
         "config": plain(config),
-        "versions": versions(),
+        "versions": subject["versions"],
     }
+    if before is not None and before["versions"] != result["versions"]:
+        result["versions_before"] = before["versions"]  # of what was solved before it was stopped
     if not trainer.is_global_zero:
         return
     write_result(folder, result, evaluation.metrics, evaluation.table)
-    pictures = saved(folder / "pictures", evaluation, data.data(data.evaluation_split()))
+    journal.finish()
+    save = save_pictures if config.views is None else save_summaries
+    pictures = save(folder / "pictures", evaluation, data.data(data.evaluation_split()))
+    print_results(folder, config, result, pictures)
+
+
+def build_evaluation(config: DictConfig, solver: Solver, data: PairDataModule, journal: Journal) -> Evaluation:
+    """The evaluation of a config, on pairs or on sets of views, with the data set to it."""
+    starts, batch_pairs = registry.build("start", config.start), pairs_at_once(config, solver)
+    if config.views is None:
+        data.evaluate_on(config.protocol, config.seed, batch_pairs)
+        return Evaluation(solver, starts, config.seed, journal)
+    if config.protocol != "ordered":
+        raise UserError(f"protocol={config.protocol} is one of pairs; views={config.views} has its own, leave it out")
+    data.evaluate_on_sets(config.views, batch_pairs)
+    return ViewSetEvaluation(solver, starts, config.seed, config.views, journal)
+
+
+def pairs_at_once(config: DictConfig, solver: Solver) -> int:
+    """Pairs a batch: `batch_pairs`, else by the size of the solver's networks. A batch is saved when it is solved."""
+    if config.batch_pairs is None:
+        parameters = sum(each.numel() for network in solver.networks() for each in network.parameters())
+        return LARGE_PAIRS if parameters > LARGE else EVALUATION_PAIRS
+    if not isinstance(config.batch_pairs, int) or config.batch_pairs < 1:
+        raise UserError(f"batch_pairs must be a number of pairs, or null; got {config.batch_pairs}")
+    return config.batch_pairs
+
+
+def print_results(folder: Path, config: DictConfig, result: dict[str, Any], pictures: Sequence[Path]) -> None:
+    """The table, the cost, and where the rest is."""
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     choices = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
-    counted = f"pairs ({protocol})" if config.views is None else f"poses in sets of {config.views} images"
+    counted = f"pairs ({config.protocol})" if config.views is None else f"poses in sets of {config.views} images"
     title = f"{choices}, {result['pairs']} {counted}"
     console.print(terminal_table(title, summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
@@ -70,3 +123,4 @@ def run(config: DictConfig) -> None:
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)
     names = ", ".join(picture.name for picture in pictures)
     console.print(f"pictures: {folder / 'pictures'} ({names})", soft_wrap=True)
+    console.print(f"page:     {write_run_page(folder, 'eval')}", soft_wrap=True)

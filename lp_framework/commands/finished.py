@@ -1,18 +1,20 @@
-"""Jobs of a sweep that have run before: an interrupted sweep continues where it stopped."""
+"""Runs that have gone before: finished jobs of a sweep are skipped, runs that were stopped go on."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from lp_framework import registry
 from lp_framework.commands.building import plain
 from lp_framework.errors import UserError
-from lp_framework.evaluation.runs import RESULT, differences, dotted
+from lp_framework.evaluation.journal import FOLDER, MOVABLE, compared_settings, unfinished
+from lp_framework.evaluation.runs import RESULT, differences
 from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint
 
 
@@ -27,12 +29,13 @@ def is_finished(folder: Path, config: DictConfig) -> bool:
     file = folder / RESULT
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        settings = compared_settings(result["config"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
     checkpoint = _checkpoint(config)
-    before = {**dotted(result.get("config", {})), "checkpoint": result.get("checkpoint")}
-    now = {**dotted(json.loads(json.dumps(plain(config)))), "checkpoint": str(checkpoint) if checkpoint else None}
-    changed = {key: pair for key, pair in differences(before, now).items() if key != "plugins"}
+    before = {**settings, "checkpoint": result.get("checkpoint")}
+    now = {**compared_settings(json.loads(json.dumps(plain(config)))), "checkpoint": _text(checkpoint)}
+    changed = differences(before, now)
     advice = "give another hydra.sweep.dir, or remove it"
     if changed:
         said = ", ".join(f"{key} is {there} there, {here} here" for key, (there, here) in list(changed.items())[:3])
@@ -43,8 +46,43 @@ def is_finished(folder: Path, config: DictConfig) -> bool:
     return True
 
 
+def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, Path | None]:
+    """The config and the checkpoint of the `eval` in `folder` that was stopped; it may go on on other devices.
+
+    Raises `UserError` where there is none, and for `overrides` of other settings.
+    """
+    if (folder / RESULT).is_file():
+        raise UserError(f"resume={folder}: has solved all of its pairs, {folder / RESULT} has the results")
+    subject = unfinished(folder)
+    if subject is None:
+        raise UserError(f"resume={folder}: holds no {FOLDER} evaluation to go on from; give the folder of one")
+    previous = OmegaConf.create(subject["config"])
+    checkpoint = subject["checkpoint"]
+    saved = folder / FOLDER
+    return with_overrides(previous, config, overrides, MOVABLE, saved), None if checkpoint is None else Path(checkpoint)
+
+
+def with_overrides(
+    previous: DictConfig, config: DictConfig, overrides: Sequence[str], changeable: tuple[str, ...], saved: Path
+) -> DictConfig:
+    """The config of a run that goes on: `previous`, of the file or folder `saved`, with what the command line changes.
+
+    Raises `UserError` where `overrides`, the command line's, have a key that does not begin as one of `changeable`.
+    """
+    keys = {override.partition("=")[0].strip("+~") for override in overrides} - {"resume", "plugins"}
+    for key in sorted(keys):
+        if not key.startswith(changeable):
+            raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
+        OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
+    return previous
+
+
 def _checkpoint(config: DictConfig) -> Path | None:
     """The checkpoint that the job would use, None for a solver without a model."""
     if "model" not in registry.component_names(registry.get("solver", config.solver.name)):
         return None
     return default_checkpoint() if config.checkpoint is None else find_checkpoint(config.checkpoint)
+
+
+def _text(checkpoint: Path | None) -> str | None:
+    return None if checkpoint is None else str(checkpoint)

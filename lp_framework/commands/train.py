@@ -34,11 +34,13 @@ from lp_framework.commands.building import (
     seed_run,
     versions,
 )
+from lp_framework.commands.finished import with_overrides
 from lp_framework.errors import UserError
-from lp_framework.evaluation.tables import write_csv, write_json
+from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, KeepRecipe, read_checkpoint
 from lp_framework.models.model_folder import RECIPE
 from lp_framework.models.pose_model import PoseModel
+from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.pictures import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
@@ -67,12 +69,12 @@ def run(config: DictConfig) -> None:
         data.cache_features(extractor)
     trainer = build_trainer(config, folder, callbacks(config, folder, recipe), loggers(config, folder))
     if trainer.is_global_zero:
-        OmegaConf.save(config, folder / "config.yaml")
+        write_text(folder / "config.yaml", OmegaConf.to_yaml(config))
         if checkpoint is not None:
             keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
     trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
     if trainer.is_global_zero:
-        report(trainer, folder, config, recipe)
+        report(trainer, folder, config, recipe, data.fingerprint("all_train"))
 
 
 def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -85,12 +87,7 @@ def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -
         raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
     previous = OmegaConf.load(saved)
     assert isinstance(previous, DictConfig)
-    keys = {override.partition("=")[0].strip("+~") for override in overrides} - {"resume", "plugins"}
-    for key in sorted(keys):
-        if key.partition(".")[0] != "trainer":
-            raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
-        OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
-    return previous
+    return with_overrides(previous, config, overrides, ("trainer",), saved)
 
 
 def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
@@ -160,18 +157,19 @@ def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
     writer.metrics_keys = columns
 
 
-def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any]) -> None:
-    """`REPORT` and the closing lines."""
+def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any], fingerprint: str) -> None:
+    """`REPORT` and the closing lines; `fingerprint` is that of all training views."""
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
     write_json(
         folder / REPORT,
         {**recipe, "seed": config.seed, "epochs": trainer.current_epoch, "steps": trainer.global_step,
-         "final": losses, "versions": versions()},
+         "final": losses, "fingerprints": {"views": fingerprint}, "versions": versions()},
     )  # fmt: skip
     console = Console(soft_wrap=True, highlight=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
     console.print(f"model:   {folder / FOLDER / BEST}")
     for picture in save_training_picture(folder):
         console.print(f"picture: {picture}")
+    console.print(f"page:    {write_run_page(folder, 'train')}")
     console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)))}")

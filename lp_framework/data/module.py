@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -19,7 +18,7 @@ from lp_framework.data.pairs import BlockSampler, ListSampler, PairBatch, PairDa
 from lp_framework.data.views import ObjectViews, object_names, read_views
 from lp_framework.errors import UserError
 
-EVALUATION_PAIRS = 224  # pairs a batch; four objects of eight test views
+EVALUATION_PAIRS = 224  # pairs a batch, by default; four objects of eight test views
 LARGEST_SET = 8  # images that are evaluated together at most, as in the paper's multi-view table
 
 
@@ -60,8 +59,11 @@ class PairDataModule(LightningDataModule):
         self._extractor: FeatureExtractor | None = None
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images a set, where sets are evaluated
+        self._evaluation_pairs = EVALUATION_PAIRS
+        self._left_out = np.empty(0, dtype=np.int64)
         self._folders: dict[str, list[ObjectViews]] = {}
         self._tables: dict[str, ViewTable] = {}
+        self._image_keys: dict[str, str] = {}
 
     # ------------------------------------------------------------ what there is
 
@@ -82,8 +84,17 @@ class PairDataModule(LightningDataModule):
         """The objects of this data set, sorted: all whose views are in `path`."""
         return object_names(self.path)
 
+    def fingerprint(self, split: str) -> str:
+        """A text that changes with what a split's batches are made of: its images, names, cameras and labels."""
+        table, folder = self.table(split), _folder(split)
+        if folder not in self._image_keys:
+            self.data(split)
+        names = [file.name for file in table.files]
+        labels = list(zip(table.names, table.counts, table.ambiguities, table.unique_answer, strict=True))
+        return content_key([], "split", self._image_keys[folder], names, labels, table.cameras.tolist())
+
     def _on_disk(self, split: str) -> list[ObjectViews]:
-        folder = "test" if split == "test" else "train"
+        folder = _folder(split)
         if folder not in self._folders:
             self._folders[folder] = [read_views(self.path, name, folder) for name in self.names()]
         return self._folders[folder]
@@ -100,18 +111,26 @@ class PairDataModule(LightningDataModule):
         files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
         return replace(views, files=files, cameras=cameras)
 
-    def evaluate_on(self, protocol: str, seed: int) -> None:
+    def evaluate_on(self, protocol: str, seed: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
         """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
-        self._evaluation, self._views = (protocol, seed), None
+        self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), None, batch_pairs
 
-    def evaluate_on_sets(self, views: int) -> None:
+    def evaluate_on_sets(self, views: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
         """From now on prepare only the test views; `test_dataloader` gives `ViewTable.view_sets` of so many images.
 
-        A set comes as the pairs of its first view with each other one, `views` - 1 in a row, a batch holds whole sets.
+        A set comes as the pairs of its first view with each other one, `views` - 1 in a row, a batch holds whole sets:
+        as many as make `batch_pairs` pairs, one at least.
         """
         if not isinstance(views, int) or not 2 <= views <= LARGEST_SET:
             raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
-        self._evaluation, self._views = ("view_sets", 0), views
+        self._evaluation, self._views, self._evaluation_pairs = ("view_sets", 0), views, batch_pairs
+
+    def leave_out(self, pairs: NDArray[np.int64]) -> None:
+        """From now on `test_dataloader` leaves out the batches all of whose pairs are among these, by number.
+
+        The other batches stay as they are, so that what is computed of them stays the same to the last bit.
+        """
+        self._left_out = pairs
 
     def evaluation_split(self) -> str:
         """The split that the protocol of `evaluate_on` takes its pairs from."""
@@ -121,14 +140,13 @@ class PairDataModule(LightningDataModule):
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
         self._extractor = extractor
 
-    def _arrays(self, files: Sequence[Path]) -> tuple[NDArray, NDArray | None]:
-        key, images = decoded_views(files, self.image_size, self.cache)
+    def _features(self, key: str, images: NDArray) -> NDArray | None:
         if self._extractor is None:
-            return images, None
+            return None
         extractor = self._extractor
         shape = (len(images), extractor.trunk_dim)
         feature_key = content_key([], "features", key, extractor.fingerprint())
-        return images, cached_array(
+        return cached_array(
             self.cache, feature_key, shape, np.float32, lambda array: _extract(extractor, images, array)
         )
 
@@ -139,7 +157,9 @@ class PairDataModule(LightningDataModule):
         table = self.table(split)
         # Training and validation views share one array, so that another way to divide them decodes nothing anew.
         files = [file for views in self._on_disk(split) for file in views.files]
-        images, features = self._arrays(files)
+        key, images = decoded_views(files, self.image_size, self.cache)
+        self._image_keys[_folder(split)] = key
+        features = self._features(key, images)
         if files == table.files:
             return PairData(table, images, features)
         place = {file: row for row, file in enumerate(files)}
@@ -168,12 +188,25 @@ class PairDataModule(LightningDataModule):
         if self._views is not None:
             sets = data.table.view_sets(self._views)
             pairs = np.stack([np.repeat(sets[:, :1], self._views - 1, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
-            return self._listed(data, pairs, EVALUATION_PAIRS // (self._views - 1) * (self._views - 1))
+            sets_at_once = max(1, self._evaluation_pairs // (self._views - 1))
+            return self._remaining(data, pairs, sets_at_once * (self._views - 1))
         protocol, seed = self._evaluation or ("ordered", 0)
-        return self._listed(data, data.table.pairs(protocol, seed), EVALUATION_PAIRS)
+        return self._remaining(data, data.table.pairs(protocol, seed), self._evaluation_pairs)
+
+    def _remaining(self, data: PairData, pairs: NDArray[np.int64], batch_pairs: int) -> DataLoader[PairBatch]:
+        """The pairs in batches, without those of `leave_out`."""
+        out = np.isin(data.table.pair_number(pairs[:, 0], pairs[:, 1]), self._left_out)
+        whole = np.logical_and.reduceat(
+            out, np.arange(0, len(pairs), batch_pairs)
+        )  # of each batch, whether all are out
+        return self._listed(data, pairs[~np.repeat(whole, batch_pairs)[: len(pairs)]], batch_pairs)
 
     def _listed(self, data: PairData, pairs: NDArray[np.int64], batch_pairs: int) -> DataLoader[PairBatch]:
         return DataLoader(data, batch_size=None, sampler=ListSampler(pairs, batch_pairs, *self._ranks()))
+
+
+def _folder(split: str) -> str:
+    return "test" if split == "test" else "train"
 
 
 @torch.inference_mode()

@@ -73,8 +73,9 @@ class ViewTable:
 
     def pair_ids(self, numbers: Tensor) -> Tensor:
         """Ids `[P]` of pairs by number: hashes of object and image names, the same whatever else the table holds."""
-        names = [f"{self.names[self.object_of_view[view]]}/{file.name}" for view, file in enumerate(self.files)]
         pairs = [divmod(number, len(self)) for number in numbers.tolist()]
+        views = {view for pair in pairs for view in pair}
+        names = {view: f"{self.names[self.object_of_view[view]]}/{self.files[view].name}" for view in views}
         return torch.tensor([stable_id(f"{names[r]} {names[q]}") for r, q in pairs])
 
     def pairs(self, protocol: str = "ordered", seed: int = 0) -> NDArray[np.int64]:

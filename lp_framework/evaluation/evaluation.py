@@ -7,11 +7,12 @@ from typing import Any
 import torch
 from lightning import LightningModule
 from torch import Tensor
-from torchmetrics import SumMetric
 
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch, ViewTable
-from lp_framework.evaluation.metrics import PoseMetrics
+from lp_framework.errors import UserError
+from lp_framework.evaluation.journal import Journal
+from lp_framework.evaluation.metrics import Costs, PoseMetrics, SolvedBatch, without_success_rates
 from lp_framework.geometry import (
     apply_relative_pose,
     at_optimal_scale,
@@ -27,23 +28,52 @@ from lp_framework.solvers.starts import Starts
 class Evaluation(LightningModule):
     """Runs a solver under `Trainer.test` with a `PairDataModule`, so on any number of devices and processes.
 
-    Afterwards `result` gives the metrics (see `PoseMetrics`), `metrics.rows()` a row a pair.
+    Afterwards `result` gives the metrics (see `PoseMetrics`), `metrics.rows()` a row a pair. With a `journal` every
+    batch is kept as it comes, and batches that the journal has from an earlier run are not solved again.
     """
 
     table: ViewTable
     metrics: PoseMetrics
 
-    def __init__(self, solver: Solver, starts: Starts, seed: int) -> None:
+    def __init__(self, solver: Solver, starts: Starts, seed: int, journal: Journal | None = None) -> None:
         super().__init__()
-        self.solver, self.starts, self.seed = solver, starts, seed
+        self.solver, self.starts, self.seed, self.journal = solver, starts, seed, journal
         # Registered, so that Lightning moves the networks of the solver to the device.
         self.networks = torch.nn.ModuleList(solver.networks())
-        self.solved, self.seconds, self.passes = SumMetric(), SumMetric(), SumMetric()
+        self.costs = Costs()
 
     def setup(self, stage: str) -> None:
         """The objects are known once the data are prepared."""
         data: PairDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.gather_for(data.table(data.evaluation_split()))
+        if self.journal is not None:
+            self._go_on(self.journal, data)
+
+    def _go_on(self, journal: Journal, data: PairDataModule) -> None:
+        """Take up what an earlier run has solved. One process reads it, lest others meet what this run has added."""
+        found: list[SolvedBatch] | UserError | None = None
+        if self.trainer.is_global_zero:
+            try:
+                found = journal.begin(data.fingerprint(data.evaluation_split()))
+            except UserError as error:
+                found = error
+        found = self.trainer.strategy.broadcast(found)
+        if isinstance(found, UserError):
+            raise found if self.trainer.is_global_zero else SystemExit(1)  # said once
+        assert found is not None
+        if not found:
+            return
+        pairs = torch.cat([batch.pair for batch in found])
+        data.leave_out(pairs.numpy())
+        self.print(f"going on: {len(pairs.unique())} pairs have been solved before")
+        # Each process has some, since a metric without any cannot be gathered.
+        for batch in found[self.trainer.global_rank :: self.trainer.world_size] or found[:1]:
+            self.count(batch)
+
+    def count(self, batch: SolvedBatch) -> None:
+        """Add solved pairs to the metrics."""
+        self.metrics.update(*batch[:-2])
+        self.costs.update(batch.pair, batch.seconds, batch.passes)
 
     def gather_for(self, table: ViewTable) -> None:
         """Start with no results, for pairs of the views in `table`."""
@@ -60,19 +90,27 @@ class Evaluation(LightningModule):
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:
         solution = self.solve(batch)
         rotation, translation = errors(solution, batch)
-        poses = solution.answer().double()
-        self.metrics.update(batch.pairs, batch.objects[batch.reference], rotation, translation, solution.chosen, poses)
-        self.solved.update(len(batch))
-        self.seconds.update(solution.cost.seconds)
-        self.passes.update(solution.cost.network_passes)
+        solved = SolvedBatch(
+            pair=batch.pairs,
+            object=batch.objects[batch.reference],
+            rotation=rotation.double(),
+            translation=translation.double(),
+            chosen=solution.chosen,
+            answer=solution.answer().double(),
+            seconds=solution.cost.seconds,
+            passes=solution.cost.network_passes,
+        )
+        self.count(solved)
+        if self.journal is not None:
+            self.journal.append(solved, self.global_rank)
 
     def result(self) -> dict[str, Any]:
         """The metrics with the cost: seconds and network passes a pair."""
-        solved = self.solved.compute()
+        costs, metrics = self.costs.compute(), self.metrics.compute()
         return {
-            **self.metrics.compute(),
-            "seconds_per_pair": (self.seconds.compute() / solved).item(),
-            "network_passes_per_pair": (self.passes.compute() / solved).item(),
+            **(without_success_rates(metrics) if self.solver.one_answer else metrics),
+            "seconds_per_pair": costs["seconds"] / costs["pairs"],
+            "network_passes_per_pair": costs["passes"] / costs["pairs"],
         }
 
 

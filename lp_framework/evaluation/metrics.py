@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +15,19 @@ from lp_framework.models.pair_mean import first_of_each
 ROTATION_THRESHOLDS = (5, 15, 30)  # degrees
 TRANSLATION_THRESHOLD = 0.2  # in units of the object's longest side
 STATES = ("pair", "object", "rotation", "translation", "chosen", "answer")
+
+
+class SolvedBatch(NamedTuple):
+    """What is kept of a batch of P pairs from N starts: what `PoseMetrics.update` takes, and what the batch took."""
+
+    pair: Tensor  # [P] int64
+    object: Tensor  # [P] int64
+    rotation: Tensor  # [P, N] float64, degrees
+    translation: Tensor  # [P, N] float64, scene units
+    chosen: Tensor  # [P] int64
+    answer: Tensor  # [P, 3] float64
+    seconds: float
+    passes: int
 
 
 def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str, float]:
@@ -41,6 +54,19 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
     metrics["rotation_error"] = median(rotation.gather(1, pick))
     metrics["translation_error"] = median(translation.gather(1, pick))
     return metrics
+
+
+def without_success_rates(metrics: dict[str, Any]) -> dict[str, Any]:
+    """The metrics, at any depth, without the shares of starts, of which a solver with one answer a pair has none.
+
+    >>> without_success_rates({"metrics": {"R@5": 0.5, "SR@5": 0.5}, "pairs": 2})
+    {'metrics': {'R@5': 0.5}, 'pairs': 2}
+    """
+    return {
+        name: without_success_rates(value) if isinstance(value, dict) else value
+        for name, value in metrics.items()
+        if not name.startswith(("SR@", "SR(R)@"))
+    }
 
 
 def median(values: Tensor) -> float:
@@ -109,22 +135,48 @@ class PoseMetrics(Metric):
         # Here, and only here, torchmetrics has the states of all processes together.
         self._all_rows = rows = self._gathered()
 
-        def over(objects: Sequence[int]) -> dict[str, float] | None:
-            mask = torch.isin(rows["object"], torch.tensor(list(objects)))
-            if not mask.any():
+        def over(chosen: Tensor) -> dict[str, float] | None:
+            if not len(chosen):
                 return None
-            return summarise(rows["rotation"][mask], rows["translation"][mask], rows["chosen"][mask])
+            return summarise(rows["rotation"][chosen], rows["translation"][chosen], rows["chosen"][chosen])
 
-        everything = range(len(self.names))
-        unique = [index for index in everything if self.unique_answer[index]]
+        def rows_of(objects: list[bool]) -> Tensor:
+            return torch.tensor(objects)[rows["object"]].nonzero().flatten()
+
+        counts = torch.bincount(rows["object"], minlength=len(self.names))
+        of_each = rows["object"].argsort(stable=True).split(counts.tolist())  # the rows of each object
         classes = sorted(set(self.ambiguities), key=["unique", "twofold", "continuous", "unlabelled"].index)
         return {
-            "metrics": over(everything),
-            "metrics_unique_answer": over(unique) if unique else None,
-            "per_object": {self.names[index]: over([index]) for index in everything},
+            "metrics": over(torch.arange(len(rows["pair"]))),
+            "metrics_unique_answer": over(rows_of([answer is True for answer in self.unique_answer])),
+            "per_object": {name: over(chosen) for name, chosen in zip(self.names, of_each, strict=True)},
             "per_ambiguity": {
-                name: over([index for index in everything if self.ambiguities[index] == name]) for name in classes
+                name: over(rows_of([ambiguity == name for ambiguity in self.ambiguities])) for name in classes
             },
             "unanswered": rows["rotation"].gather(1, rows["chosen"][:, None]).isnan().double().mean().item(),
             "pairs": len(rows["pair"]),
         }
+
+
+class Costs(Metric):
+    """Pairs, seconds and network passes of batches that count once each, however many processes met one."""
+
+    full_state_update = False
+    batch: list[Tensor]
+    cost: list[Tensor]
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self.add_state("batch", [], dist_reduce_fx="cat")  # the number of its first pair
+        self.add_state("cost", [], dist_reduce_fx="cat")  # pairs, seconds, passes
+
+    def update(self, pair: Tensor, seconds: float, passes: int) -> None:
+        """Add a batch of pairs numbered `[P]`."""
+        self.batch.append(pair[:1])
+        self.cost.append(torch.tensor([[len(pair), seconds, passes]], dtype=torch.float64, device=pair.device))
+
+    def compute(self) -> dict[str, float]:
+        """Their sums: `pairs`, `seconds`, `passes`."""
+        batch, cost = dim_zero_cat(self.batch).cpu(), dim_zero_cat(self.cost).cpu()
+        pairs, seconds, passes = cost[first_of_each(batch)].sum(dim=0).tolist()
+        return {"pairs": pairs, "seconds": seconds, "passes": passes}

@@ -6,6 +6,7 @@ import torch
 
 from lp_framework.data.pairs import PairBatch
 from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.journal import Journal
 from lp_framework.keyed_random import keyed_bits
 from lp_framework.solvers.base import Solution, Solver, ViewSets
 from lp_framework.solvers.starts import Starts
@@ -18,8 +19,8 @@ class ViewSetEvaluation(Evaluation):
     relative to it is judged. A set has one answer, so SR equals R.
     """
 
-    def __init__(self, solver: Solver, starts: Starts, seed: int, views: int) -> None:
-        super().__init__(solver, starts, seed)
+    def __init__(self, solver: Solver, starts: Starts, seed: int, views: int, journal: Journal | None = None) -> None:
+        super().__init__(solver, starts, seed, journal)
         self.others = views - 1
 
     def solve(self, batch: PairBatch) -> Solution:

@@ -1,0 +1,143 @@
+"""An evaluation's results as they come, from which a killed run goes on.
+
+    <run>/unfinished/evaluation.json     what is evaluated: configuration, checkpoint, fingerprints; and the versions
+    <run>/unfinished/rank_0.jsonl ...    a line a batch of pairs, behind its checksum; a file a process
+
+The folder is there while the evaluation is unfinished. A line that a kill cut short, or that was altered, does not
+match its checksum, and its pairs are solved again. JSON keeps every bit of a number, NaN included.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lp_framework.errors import UserError
+from lp_framework.evaluation.metrics import SolvedBatch
+from lp_framework.evaluation.runs import RESULT, differences, dotted
+from lp_framework.evaluation.tables import write_text
+
+log = logging.getLogger(__name__)
+
+FOLDER = "unfinished"
+SUBJECT = "evaluation.json"
+MOVABLE = ("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy")  # may change on the way
+WHOLE_NUMBERS = ("pair", "object", "chosen")
+DECIMALS = ("rotation", "translation", "answer")
+
+
+class Journal:
+    """The journal of the run in `folder`, of an evaluation that `subject` describes: names and numbers, nested.
+
+    An evaluation goes on only where its subject is that of before, and so is the data's fingerprint.
+    """
+
+    def __init__(self, folder: Path, subject: Mapping[str, Any]) -> None:
+        self.folder, self.run, self.subject = folder / FOLDER, folder, dict(subject)
+
+    def begin(self, views: str) -> list[SolvedBatch]:
+        """What has been solved before, if anything; else the journal is begun. `views` is the data's fingerprint.
+
+        Raises `UserError` for a journal of another evaluation. Results of a finished one are made anew.
+        """
+        now = {**self.subject, "views": views}
+        if goes_on(self.run, now):
+            return list(self._read())
+        shutil.rmtree(self.folder, ignore_errors=True)
+        (self.run / RESULT).unlink(missing_ok=True)
+        self.folder.mkdir(parents=True)
+        write_text(self.folder / SUBJECT, json.dumps(now, indent=2) + "\n")
+        return []
+
+    def append(self, batch: SolvedBatch, rank: int) -> None:
+        """Keep a batch that the process of this rank has solved; it is on disk when this returns."""
+        values = {
+            name: value.tolist() if isinstance(value, torch.Tensor) else value
+            for name, value in batch._asdict().items()
+        }
+        text = json.dumps(values, separators=(",", ":")).encode()
+        line = b"%08x %s\n" % (zlib.crc32(text), text)
+        with (self.folder / f"rank_{rank}.jsonl").open("ab+") as file:
+            if file.tell() > 0:
+                file.seek(-1, os.SEEK_END)
+                line = line if file.read(1) == b"\n" else b"\n" + line  # after a line that was cut short
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def finish(self) -> None:
+        """Remove the journal, of an evaluation whose results are written."""
+        shutil.rmtree(self.folder, ignore_errors=True)  # beside results it counts for nothing
+
+    def _read(self) -> Iterator[SolvedBatch]:
+        for file in sorted(self.folder.glob("rank_*.jsonl")):
+            for number, line in enumerate(file.read_bytes().split(b"\n")):
+                checksum, _, text = line.partition(b" ")
+                if checksum == b"%08x" % zlib.crc32(text):
+                    yield _solved(json.loads(text))
+                elif line:
+                    log.info("%s: line %d is cut short or damaged, its pairs are solved again", file, number + 1)
+
+
+def unfinished(folder: Path) -> dict[str, Any] | None:
+    """What the unfinished evaluation in a run's folder is of, None where there is none."""
+    if (folder / RESULT).exists():
+        return None
+    try:
+        subject: dict[str, Any] = json.loads((folder / FOLDER / SUBJECT).read_text(encoding="utf-8"))
+        whole = isinstance(subject["config"], dict) and isinstance(subject["checkpoint"], str | None)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return subject if whole else None
+
+
+def goes_on(folder: Path, subject: Mapping[str, Any]) -> bool:
+    """Whether there is an unfinished evaluation in `folder` and it is of this subject, or part of a subject.
+
+    Raises `UserError` for another one that has solved anything.
+    """
+    before = unfinished(folder)
+    if before is None:
+        return False
+    changed = differences(_compared(before), _compared({**before, **subject}))
+    if changed and any((folder / FOLDER).glob("rank_*.jsonl")):
+        said = [  # of a fingerprint nothing but whose it is
+            f"other {key}" if key in ("views", "weights") else f"{key} is {there} there, {here} here"
+            for key, (there, here) in list(changed.items())[:3]
+        ]
+        raise UserError(
+            f"{folder}: holds an unfinished evaluation of something else ({', '.join(said)}); "
+            f"give another folder, or remove {folder / FOLDER}"
+        )
+    return not changed
+
+
+def compared_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of an `eval` by dotted keys, without those on which its results do not depend.
+
+    The checkpoint is left out as well: which file is meant by a path, or by none, is to be compared.
+    """
+    left_out = {"plugins", "resume", "checkpoint", *MOVABLE}
+    return {key: value for key, value in dotted(config).items() if key not in left_out}
+
+
+def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
+    others = {key: value for key, value in subject.items() if key not in ("config", "versions")}
+    return {**compared_settings(subject["config"]), **others}
+
+
+def _solved(values: Mapping[str, Any]) -> SolvedBatch:
+    return SolvedBatch(
+        **{name: torch.tensor(values[name], dtype=torch.int64) for name in WHOLE_NUMBERS},
+        **{name: torch.tensor(values[name], dtype=torch.float64) for name in DECIMALS},
+        seconds=values["seconds"],
+        passes=values["passes"],
+    )

@@ -1,0 +1,186 @@
+"""`eval` and `train` on two processes, started by the real command: the numbers of one, sizes that do not divide."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tiny_runs import OBJECTS, ROOT, Commands, Ran
+
+from lp_framework import registry
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.pairs import PairBatch
+from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.models.pose_model import ScoreModel
+
+pytestmark = pytest.mark.skipif(
+    not (torch.distributed.is_available() and torch.distributed.is_gloo_available()),
+    reason="PyTorch was built without gloo, by which processes on CPUs speak",
+)
+TEST_VIEWS = 5
+SPREAD = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
+EVALUATION = ("checkpoint=score", "batch_pairs=7", "solver.iterations=5")  # 80 pairs are 12 batches, the last one of 3
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory) -> Commands:
+    commands = Commands(tmp_path_factory.mktemp("processes"), test_views=TEST_VIEWS)
+    (commands.folder / "plugins" / "tmp_tiny" / "tmp_tiny_unseen.py").write_text(NO_PICTURES)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as in the processes, so that numbers are equal to the last bit
+    trained = commands.here("score", "train", "trainer.max_epochs=1", "backbone.pause=0.05")
+    assert trained.status == 0, trained.err
+    yield commands
+    torch.set_num_threads(threads)
+
+
+# Pictures take most of a run's time.
+NO_PICTURES = """
+import lp_framework.viz.pictures
+
+lp_framework.viz.pictures.save_pictures = lambda *arguments: []
+lp_framework.viz.pictures.save_summaries = lambda *arguments: []
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch):
+    """In this process neither."""
+    for module in ("lp_framework.viz.pictures", "lp_framework.commands.eval"):
+        monkeypatch.setattr(f"{module}.save_pictures", lambda *arguments: [])
+        monkeypatch.setattr(f"{module}.save_summaries", lambda *arguments: [])
+
+
+def two_processes(commands: Commands, name: str, command: str, *overrides: str) -> Ran:
+    """The command on two processes; that there were two is in the log of the first, which waits for the other."""
+    process = commands.start(name, command, *overrides, *SPREAD)
+    out, err = process.communicate(timeout=500)
+    assert (process.returncode, err) == (0, ""), err
+    log = (commands.folder / name / f"{command}.log").read_text()
+    assert "MEMBER: 1/2" in log and "All distributed processes registered. Starting with 2 processes" in log
+    return Ran(process.returncode, out, err, commands.folder / name)
+
+
+def assert_the_same(ran: Ran, wanted: Ran) -> None:
+    """Every number but the time, to the last bit: batches are the same however they are shared out."""
+    for name in ("pairs.csv", "results.csv"):
+        assert (ran.folder / name).read_bytes() == (wanted.folder / name).read_bytes(), name
+    apart = ("seconds_per_pair", "config")
+    found, expected = ({key: value for key, value in each.json().items() if key not in apart} for each in (ran, wanted))
+    assert found == expected
+
+
+# ---------------------------------------------------------------- evaluation
+
+
+def test_two_processes_give_the_results_of_one_on_sets_of_views(commands):
+    settings = ("views=3", "solver=multiview", "solver.second_stage=false")
+    one = commands.here("sets_one", "eval", *EVALUATION, *settings)
+    assert one.status == 0, one.err
+    two = two_processes(commands, "sets_two", "eval", *EVALUATION, *settings)
+    assert two.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 2  # in batches of three sets, of which there are seven
+    assert_the_same(two, one)
+
+
+def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands):
+    whole = commands.here("whole", "eval", *EVALUATION)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-m", "lp_framework", *commands.arguments("killed", "eval", *EVALUATION, *SPREAD)]
+    process = subprocess.Popen(
+        line, cwd=commands.folder, env=environment, start_new_session=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    journals = [commands.folder / "killed" / "unfinished" / f"rank_{rank}.jsonl" for rank in (0, 1)]
+    deadline = time.monotonic() + 300
+    while not all(file.exists() for file in journals) and time.monotonic() < deadline:
+        assert process.poll() is None
+        time.sleep(0.002)
+    os.killpg(process.pid, signal.SIGKILL)  # both
+    process.wait()
+    solved = {
+        pair for file in journals for row in file.read_bytes().split(b"\n")[:-1] for pair in json.loads(row[9:])["pair"]
+    }
+    assert 0 < len(solved) < whole.json()["pairs"]
+    ran = commands.here("unused", "eval", "resume=killed", "trainer.devices=1", "trainer.strategy=auto")
+    assert ran.status == 0, ran.err
+    assert f"going on: {len(solved)} pairs have been solved before" in ran.out
+    ran.folder = commands.folder / "killed"
+    assert_the_same(ran, whole)
+
+
+def test_an_evaluation_that_one_process_began_is_gone_on_with_by_two(commands, monkeypatch):
+    whole = commands.here("begun_whole", "eval", *EVALUATION)
+    solve = Evaluation.test_step
+
+    def until(self: Evaluation, batch: PairBatch, batch_idx: int) -> None:
+        if batch_idx == 11:
+            raise RuntimeError("stopped")
+        solve(self, batch, batch_idx)
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="stopped"):
+        patch.setattr(Evaluation, "test_step", until)
+        commands.here("begun", "eval", *EVALUATION)
+    two = two_processes(commands, "begun", "eval", *EVALUATION)  # one batch is left for both
+    assert "going on: 77 pairs have been solved before" in two.out
+    assert_the_same(two, whole)
+
+
+# ---------------------------------------------------------------- training
+
+
+class Share(ScoreModel):
+    """A score model that takes itself for one process among several; Lightning asks its trainer for these."""
+
+    global_step, global_rank = 0, 0
+
+    def log(self, *arguments: object, **named: object) -> None:
+        """Nobody listens."""
+
+
+def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(commands, clean_registry, tmp_path):
+    settings = ("model.schedule=constant", "trainer.max_epochs=2", "data.batch_pairs=40", "data.validation_views=2")
+    initial = commands.here("initial", "train", *settings, "model.learning_rate=0")
+    two = two_processes(commands, "trained", "train", *settings)
+
+    registry.discover([str(commands.folder / "plugins")])
+    model = Share(registry.build("backbone", {"name": "tmp_tiny"}), hidden=16, schedule="constant")
+    model.load_state_dict(initial.checkpoint()["state_dict"], strict=False)  # the trunk is not among them
+    optimizer = model.configure_optimizers()
+    loaders = []
+    for rank in (0, 1):
+        data = PairDataModule(str(commands.folder / "views"), str(tmp_path / "cache"), 16, 40, 3, 2, 0)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        data.cache_features(model.extractor())
+        loaders.append(data.train_dataloader())
+    sizes = set()
+    for epoch in range(2):
+        for loader in loaders:
+            loader.sampler.set_epoch(epoch)
+        for batches in zip(*loaders, strict=True):
+            sizes.add(tuple(map(len, batches)))
+            optimizer.zero_grad()
+            for model.global_rank, batch in enumerate(batches):
+                (model.training_step(batch, 0) / 2).backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            optimizer.step()
+            model.global_step += 1
+    assert any(one != other for one, other in sizes)  # the shares are not alike
+    trained = two.checkpoint()
+    assert trained["global_step"] == model.global_step > 2
+    for name, value in trained["state_dict"].items():
+        torch.testing.assert_close(value, model.state_dict()[name], rtol=1e-4, atol=1e-6, msg=name)
+    moved = max((value - initial.checkpoint()["state_dict"][name]).abs().max() for name, value in
+                trained["state_dict"].items())  # fmt: skip
+    assert moved > 1e-3
+
+
+def test_a_strategy_that_needs_gpus_says_so_in_a_sentence(commands):
+    ran = commands.here("fsdp", "eval", "checkpoint=score", "trainer.strategy=fsdp", "trainer.accelerator=cpu")
+    assert ran.error.startswith("trainer: The strategy `fsdp` requires a GPU accelerator")
