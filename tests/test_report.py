@@ -336,8 +336,8 @@ def test_several_folders_are_one_report(lp, tmp_path):
     ("arguments", "sentence"),
     [
         (("runs=nowhere",), "runs=nowhere: there is no such folder"),
-        (("runs=empty",), "runs=empty: holds no finished evaluation to report, nor an unfinished one"),
-        (("runs=stopped",), "runs=stopped: holds no finished evaluation to report: stopped/a is unfinished: no res"),
+        (("runs=empty",), "runs=empty: holds no finished run to report, nor an unfinished one"),
+        (("runs=stopped",), "runs=stopped: holds no finished run to report: stopped/a is unfinished: no res"),
         (("runs=good", "objects=unique"), "objects=unique is none of its values; did you mean 'unique_answer'? (kno"),
         ((), "runs needs a value: give runs=VALUE"),
     ],

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews
 from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.examples import EXAMPLES, pick_pairs, read_examples
 from lp_framework.evaluation.metrics import summarise
 from lp_framework.geometry import camera_to_world, wrap_angle
 from lp_framework.models.backbones import Backbone
@@ -32,7 +33,7 @@ from lp_framework.solvers.starts import Ring
 from lp_framework.viz import errors_plot
 from lp_framework.viz.errors_plot import ObjectCard, cumulative, errors_figure, objects_figure
 from lp_framework.viz.fields import FieldMap, Grid, broken_at_seam, field_figure, field_on_grid, pose_grid
-from lp_framework.viz.pictures import ExactModel, pair_contents, pick_pairs, save_pictures, save_training_picture
+from lp_framework.viz.pictures import ExactModel, pair_contents, save_pictures, save_training_picture
 from lp_framework.viz.style import ANSWER, save_figure
 from lp_framework.viz.training import Curve, read_curves, training_figure
 
@@ -419,7 +420,9 @@ def test_pictures_of_an_evaluation(with_model: bool, count: int, data: PairData,
         image = imread(file)
         assert image.shape[1] == 1600 and image[..., :3].std() > 0.02  # something is on it
         assert file.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
-    assert {file.suffix for file in (tmp_path / "pictures").iterdir()} == {".png", ".pdf"}
+    assert {file.suffix for file in (tmp_path / "pictures").iterdir() if file.is_file()} == {".png", ".pdf"}
+    kept = read_examples(tmp_path / "pictures" / EXAMPLES)
+    assert len(kept) == len(names) - 2 and all((each.trajectories is not None) == with_model for each in kept)
 
 
 def test_solver_without_model_has_one_map_without_arrows(data: PairData):

@@ -39,6 +39,7 @@ from lp_framework.geometry import apply_relative_pose
 from lp_framework.solvers.base import ViewSets
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.cameras import cameras_figure
+from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.style import save_figure
 
 log = logging.getLogger(__name__)
@@ -198,3 +199,4 @@ def _print(folder: Path, views: Sequence[View]) -> None:
         ("poses", "transforms.json, poses.csv"), ("COLMAP", "colmap"), ("images", "images"), ("picture", "cameras.png"),
     ):  # fmt: skip
         console.print(f"{what + ':':9}{folder}/{path}", soft_wrap=True)
+    console.print(f"page:    {write_run_page(folder, 'estimate')}", soft_wrap=True)

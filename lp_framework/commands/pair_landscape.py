@@ -24,7 +24,7 @@ from lp_framework.data.photographs import BackgroundRemover, mask_files, photogr
 from lp_framework.errors import UserError
 from lp_framework.evaluation.examples import EXAMPLES, Example, View, save_examples
 from lp_framework.evaluation.landscape import Landscape, landscape_grid, model_landscape, prior_landscapes
-from lp_framework.evaluation.tables import write_json
+from lp_framework.evaluation.tables import write_arrays, write_json
 from lp_framework.figures.shown_pairs import shown_pairs, words
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, wrap_angle
 from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint, load_model
@@ -118,7 +118,7 @@ def run(config: DictConfig, folder: Path) -> None:
         if field.energy is not None:
             arrays["model_energy"] = field.energy[0].cpu().numpy()
         pictures += save_figure(fields_drawn(shown, model, starts, config.seed), folder / "fields")[:1]
-    np.savez(folder / "landscape.npz", **arrays)  # type: ignore[arg-type]  # of the stub
+    write_arrays(folder / "landscape.npz", arrays)
     write_json(folder / "landscape.json", summary(config, shown, landscape, descent, checkpoint))
     save_examples(folder / "pictures" / EXAMPLES, [example(config, shown, landscape, descent)])
     report(config, folder, shown, landscape, descent, pictures)

@@ -1,4 +1,4 @@
-"""`report`: finished evaluations as tables and figures, beside the paper's numbers."""
+"""`report`: finished runs as one page; evaluations as tables and figures, too, beside the paper's numbers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from lp_framework.evaluation.report_tables import as_json, csv_rows, heading, ma
 from lp_framework.evaluation.runs import LeftOut, find_runs
 from lp_framework.evaluation.sweep_tables import Objects, SweepTable, sweep_tables
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
+from lp_framework.viz.html.run_page import PAGE, write_report_page
+from lp_framework.viz.html.runs import run_folders
+from lp_framework.viz.html.sweep_part import left_out_part, sweep_part
 from lp_framework.viz.style import save_figure
-from lp_framework.viz.sweep_pictures import sweep_figure
+from lp_framework.viz.sweep_pictures import cost_figure, sweep_figure
 
 PLACE = ("data.name", "protocol", "checkpoint", "prior.name", "solver.name", "start.name", "views")  # of all runs
 
 
 def run(config: DictConfig) -> None:
-    """Gather the runs and write `report.md`, `report.csv`, `report.json` and figures into this run's folder."""
+    """Gather the runs and write `report.html` and, of evaluations, `report.md`, `.csv`, `.json` and figures."""
     if config.objects not in typing.get_args(Objects):
         known = typing.get_args(Objects)
         raise UserError(
@@ -31,20 +34,23 @@ def run(config: DictConfig) -> None:
             f"(known: {', '.join(known)})"
         )
     where = list(config.runs) if isinstance(config.runs, ListConfig) else [config.runs]
-    found, left_out = find_runs([Path(str(each)) for each in where])
+    folders = [Path(str(each)) for each in where]
+    found, left_out = find_runs(folders)
+    finished = {run.folder.resolve() for run in found}
+    runs = [run for run in run_folders(folders) if run[1] != "eval" or run[0].resolve() in finished]
+    others = {folder.resolve() for folder, kind in runs if kind != "eval"}
+    left_out = [each for each in left_out if each.folder.resolve() not in others]
     tables, unlabelled = sweep_tables(found, config.objects)
     left_out += unlabelled
-    if not tables:
+    if not tables and not others:
         reason = f": {left_out[0].folder} is {left_out[0].reason}" if left_out else ", nor an unfinished one"
-        raise UserError(f"runs={', '.join(map(str, where))}: holds no finished evaluation to report{reason}")
+        raise UserError(f"runs={', '.join(map(str, where))}: holds no finished run to report{reason}")
     folder = run_folder()
     console = Console(width=10_000 if not Console().is_terminal else None, highlight=False)
-    console.print(f"{sum(len(row.folders) for table in tables for row in table.rows)} runs; {counted(config.objects)}")
+    console.print(f"{len(runs)} runs" + (f"; {counted(config.objects)}" if tables else ""))
     figures: list[list[Path]] = []
     for table in tables:
-        figure = sweep_figure(table)
-        name = table.experiment or "runs"
-        figures.append([] if figure is None else save_figure(figure, folder / name))
+        figures.append(drawn(table, folder))
         console.print()
         console.print(Text(title(table), style="bold"), soft_wrap=True)
         console.print(terminal(table))
@@ -53,6 +59,25 @@ def run(config: DictConfig) -> None:
     console.print()
     for path, reason in left_out:
         console.print(f"left out: {path}: {reason}", style="yellow", soft_wrap=True)
+    sections = [sweep_part(table, title(table), pngs(files)) for table, files in zip(tables, figures, strict=True)]
+    page = write_report_page(folder / PAGE, runs, [*sections, *([left_out_part(left_out)] if left_out else [])])
+    if tables:
+        write_tables(folder, config, tables, figures, left_out)
+        console.print(f"report:  {folder / 'report.md'} (report.csv, report.json)", soft_wrap=True)
+    for files in figures:
+        for file in pngs(files):
+            console.print(f"figure:  {file}", soft_wrap=True)
+    console.print(f"page:    {page}", soft_wrap=True)
+
+
+def write_tables(
+    folder: Path,
+    config: DictConfig,
+    tables: Sequence[SweepTable],
+    figures: Sequence[Sequence[Path]],
+    left_out: Sequence[LeftOut],
+) -> None:
+    """`report.md`, `report.csv` and `report.json` of evaluations."""
     write_csv(folder / "report.csv", *csv_rows(tables))
     write_text(folder / "report.md", "\n".join(document(tables, figures, left_out, config.objects)) + "\n")
     write_json(
@@ -68,10 +93,18 @@ def run(config: DictConfig) -> None:
             "versions": versions(),
         },
     )
-    console.print(f"report:  {folder / 'report.md'} (report.csv, report.json)", soft_wrap=True)
-    for files in figures:
-        for file in files[:1]:
-            console.print(f"figure:  {file}", soft_wrap=True)
+
+
+def drawn(table: SweepTable, folder: Path) -> list[Path]:
+    """Save the figures that a table calls for; their files."""
+    name = table.experiment or "runs"
+    figures = {name: sweep_figure(table), f"{name}_seconds": cost_figure(table)}
+    return [file for stem, each in figures.items() if each is not None for file in save_figure(each, folder / stem)]
+
+
+def pngs(files: Sequence[Path]) -> list[Path]:
+    """Those to be shown, of the files of figures."""
+    return [file for file in files if file.suffix == ".png"]
 
 
 def title(table: SweepTable) -> str:
@@ -93,8 +126,8 @@ def document(
     lines = ["# Report", "", f"{counted(objects)[0].upper()}{counted(objects)[1:]}."]
     for table, files in zip(tables, figures, strict=True):
         lines += ["", f"## {title(table)}", "", *markdown(table)]
-        if files:
-            lines += ["", f"![{table.experiment or 'runs'}]({files[0].name})"]
+        for file in pngs(files):
+            lines += ["", f"![{file.stem}]({file.name})"]
         if table.paper is not None:
             lines += ["", f"In italics the paper's own numbers ({table.paper.source}): *{table.paper.caption}*", ""]
             lines += [f"- {note}" for note in table.paper.notes]

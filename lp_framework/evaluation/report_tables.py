@@ -124,7 +124,7 @@ def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]
     for table in tables:
         for row in table.rows:
             rows.append([table.experiment, "runs", *(row.settings.get(key) for key in keys), len(row.seeds), row.pairs,
-                         *(part for name in METRICS for part in _rounded(row.metrics[name]))])  # fmt: skip
+                         *(part for name in METRICS for part in _rounded(row.metrics.get(name)))])  # fmt: skip
         for line in table.paper.rows if table.paper else []:
             label = f"paper: {line.label}"
             rows.append([table.experiment, label, *(line.settings.get(key) for key in keys), None, None,
@@ -164,7 +164,7 @@ def _down(table: SweepTable) -> Layout:
     for row, paper in _beside(table):
         if row is not None:
             cells = [shown(row.settings.get(key)) for key in table.columns] + [str(len(row.seeds))]
-            lines.append(_ours(cells, PRINTED, [row.metrics[name] for name in PRINTED]))
+            lines.append(_ours(cells, PRINTED, [row.metrics.get(name) for name in PRINTED]))
         for each in paper:
             label = [f"paper: {each.label}"] + [""] * len(table.columns)
             values = [number(name, each.metrics[name]) if name in each.metrics else "-" for name in PRINTED]
@@ -189,7 +189,7 @@ def _across(table: SweepTable, axis: str) -> Layout:
             cells = [shown(settings.get(key)) for key in others] + ["-".join(map(str, runs))]
             cells += [HEADINGS.get(name, name)]
             lines.append(_ours(cells, [name] * len(values), [
-                rows[value].metrics[name] if value in rows else None for value in values]))  # fmt: skip
+                rows[value].metrics.get(name) if value in rows else None for value in values]))  # fmt: skip
             theirs = [
                 next((row.metrics[name] for row in paper[value] if name in row.metrics), None) for value in values
             ]
@@ -232,7 +232,9 @@ def _ours(labels: Sequence[str], names: Sequence[str], values: Sequence[Spread |
     return Line(cells, spreads, False)
 
 
-def _rounded(value: Spread) -> tuple[float | str, float | None]:
+def _rounded(value: Spread | None) -> tuple[float | str | None, float | None]:
+    if value is None:
+        return None, None
     if not math.isfinite(value.mean):
         return "inf", None
     return round(value.mean, 5), None if value.std is None else round(value.std, 5)

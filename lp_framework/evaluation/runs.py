@@ -90,9 +90,9 @@ def read_run(folder: Path) -> Run:
             int(result["pairs"]),
             result["checkpoint"],
         )
-    except (OSError, ValueError) as error:  # of JSON, too
+    except (OSError, ValueError, RecursionError) as error:  # of JSON, too
         raise UserError(f"damaged: {file} cannot be read ({error})") from error
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UserError(f"damaged: {file} is not the result of an evaluation ({error!r})") from error
 
 
@@ -181,7 +181,7 @@ def _job(folder: Path) -> dict[str, Any]:
     try:
         hydra = yaml.load((folder / HYDRA).read_text(encoding="utf-8"), yaml.CSafeLoader)["hydra"]
         return {"name": hydra["job"]["name"], "experiment": hydra["runtime"]["choices"].get("experiment")}
-    except (OSError, YAMLError, ValueError, KeyError, TypeError):
+    except (OSError, YAMLError, ValueError, KeyError, TypeError, AttributeError):
         return {"name": None, "experiment": None}
 
 

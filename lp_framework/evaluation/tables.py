@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
@@ -39,6 +41,15 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     write_text(path, json.dumps(finite(content), indent=2) + "\n")
+
+
+def write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays by name, `.npz`, whole or not at all."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # type: ignore[arg-type]  # of the stub
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(content.getvalue())
+    os.replace(partial, path)
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
@@ -76,8 +87,10 @@ def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) 
     table.add_column("Rot.\n(deg)", justify="right", min_width=6)
     table.add_column("Trans.", justify="right", min_width=6)
     for name, metrics in rows:
-        shares = [f"{metrics[key]:.2f}".replace("0.", ".", 1) if metrics[key] < 0.995 else "1.0" for key in order]
-        table.add_row(name, *shares, f"{metrics['rotation_error']:.1f}", f"{metrics['translation_error']:.2f}")
+        shares = [metrics.get(key) for key in order]
+        cells = ["-" if each is None else f"{each:.2f}".removeprefix("0") for each in shares]
+        cells = ["1.0" if cell == "1.00" else cell for cell in cells]
+        table.add_row(name, *cells, f"{metrics['rotation_error']:.1f}", f"{metrics['translation_error']:.2f}")
     return table
 
 
@@ -91,7 +104,7 @@ def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, 
     write_csv(
         folder / "results.csv",
         ["name", *keys],
-        [[name.strip(), *(round(row[key], 5) for key in keys)] for name, row in rows],
+        [[name.strip(), *(round(row[key], 5) if key in row else "" for key in keys)] for name, row in rows],
     )
     write_csv(folder / "pairs.csv", PAIR_COLUMNS, pair_rows(metrics, table))
     write_json(folder / "results.json", result)

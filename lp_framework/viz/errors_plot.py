@@ -95,19 +95,19 @@ def _signed_square(x: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class ObjectCard:
-    """An object on the contact sheet: a view `[H, W, 3]` of it, and its recall and success rate in [0, 1]."""
+    """An object on the contact sheet: a view `[H, W, 3]` of it, and its recall and success rate, if any, in [0, 1]."""
 
     name: str
     ambiguity: str
     image: NDArray
     recall: float
-    success: float
+    success: float | None
 
 
 @styled
 def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
     """The objects, worst recall first (then worst success rate, then by name); at most the worst `MOST_OBJECTS`."""
-    ranked = sorted(cards, key=lambda card: (card.recall, card.success, card.name))
+    ranked = sorted(cards, key=lambda card: (card.recall, card.success or 0.0, card.name))
     shown = ranked[:MOST_OBJECTS]
     columns = min(len(shown), 4 if len(shown) <= 8 else 6 if len(shown) <= 18 else 7)
     rows = math.ceil(len(shown) / columns)
@@ -149,6 +149,8 @@ def _write_card(axes: Axes, card: ObjectCard, side: float) -> None:
     axes.plot([side - 0.04], [0.1], marker="s", markersize=5, color=CLASS_COLOURS[card.ambiguity], clip_on=False)
     left, width = 0.5, side - 0.5 - 0.28
     for line, (label, share) in enumerate((("R(R)@15", card.recall), ("SR(R)@30", card.success))):
+        if share is None:
+            continue
         y = 0.25 + 0.14 * line
         axes.text(0, y, label, va="center", fontsize=6, color=MUTED)
         axes.barh(y, width, left=left, height=0.05, color=FAINT)

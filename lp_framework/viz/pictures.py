@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,22 +13,16 @@ from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch, PairData
 from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.examples import EXAMPLES, gather_examples, pick_pairs, recording, save_examples
 from lp_framework.evaluation.metrics import summarise
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.models.pose_model import FieldValue, PoseModel
-from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.base import Pairs, Solution
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
 from lp_framework.viz.fields import ARROW_SPACING, DENSITY_SPACING, FieldMap, field_figure, field_on_grid
 from lp_framework.viz.style import save_figure
 from lp_framework.viz.training import LOSSES, read_curves, training_figure
-
-
-class Pick(NamedTuple):
-    """A pair worth a picture: its row, and why."""
-
-    row: int
-    reason: str
 
 
 class ExactModel(nn.Module):
@@ -59,8 +51,10 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
     """After `Trainer.test`: fields of some pairs (failures first), cumulative errors, and the objects, into `folder`.
 
     Each as PNG and PDF; returns the PNG files. The errors shown are the evaluation's; the fields' pairs are solved
-    again to see their trajectories, with the same starts and draws.
+    again to see their trajectories, with the same starts and draws. `EXAMPLES` below it gets what the page of the run
+    is drawn from.
     """
+    save_examples(folder / EXAMPLES, gather_examples(evaluation, data))
     evaluation.eval()
     rows, table = evaluation.metrics.rows(), evaluation.table
     rotation, translation = rows["rotation"].numpy(), rows["translation"].numpy()
@@ -87,7 +81,7 @@ def save_summaries(folder: Path, evaluation: Evaluation, data: PairData) -> list
     classes = [table.ambiguities[index] for index in rows["object"].tolist()]
     rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
     written = save_figure(errors_figure(rotation, translation, chosen, classes), folder / "errors")
-    written += save_figure(objects_figure(object_cards(rows, data)), folder / "objects")
+    written += save_figure(objects_figure(object_cards(rows, data, evaluation.solver.one_answer)), folder / "objects")
     return [file for file in written if file.suffix == ".png"]
 
 
@@ -100,32 +94,6 @@ def save_training_picture(folder: Path) -> list[Path]:
         return []
     rate = next((curve for name, curve in curves.items() if name.startswith("lr-")), None)
     return save_figure(training_figure(losses, rate), folder / "training")[:1]
-
-
-def pick_pairs(errors: NDArray, objects: NDArray, unique_answer: Sequence[bool | None]) -> list[Pick]:
-    """Up to four pairs by their rotation errors `[P]` and object indices `[P]`, the largest error first.
-
-    The worst, the median and the best among objects with a unique answer (among all where none is labelled so), and
-    the median among those without one. Ties go to the earlier row.
-    """
-    failed = np.nan_to_num(errors, nan=np.inf)
-    order = np.argsort(failed, kind="stable")
-    unique = np.array([unique_answer[index] is True for index in objects])
-    judged = order[unique[order]] if unique.any() else order
-    among = f"of {len(judged)} pairs" + (" with a unique answer" if unique.any() else "")
-    worst = judged[np.searchsorted(failed[judged], failed[judged[-1]])]  # the first row of those that tie
-    wanted = [
-        Pick(int(worst), f"worst {among}"),
-        Pick(int(judged[(len(judged) - 1) // 2]), f"median {among}"),
-        Pick(int(judged[0]), f"best {among}"),
-    ]
-    ambiguous = np.array([unique_answer[index] is False for index in objects])
-    others = order[ambiguous[order]]
-    if len(others):
-        reason = f"median of {len(others)} pairs without a unique answer"
-        wanted.append(Pick(int(others[(len(others) - 1) // 2]), reason))
-    first = {pick.row: pick for pick in reversed(wanted)}
-    return sorted(first.values(), key=lambda pick: (-failed[pick.row], pick.row))
 
 
 def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, NDArray, NDArray, list[FieldMap]]:
@@ -185,17 +153,11 @@ def with_field(content: FieldMap, title: str, model: PoseModel | ExactModel, pai
     return replace(content, title=title, arrows=arrows, density=None if density.energy is None else density)
 
 
-def recording(solver: Solver) -> Solver:
-    """The solver, told to keep its trajectory if it has a setting of that name; a copy, so the given one stays."""
-    if not isinstance(getattr(solver, "trajectory", None), bool):
-        return solver
-    solver = copy.copy(solver)
-    vars(solver)["trajectory"] = True
-    return solver
+def object_cards(rows: dict[str, Tensor], data: PairData, one_answer: bool) -> list[ObjectCard]:
+    """A card for every object that has pairs among the `rows` of `PoseMetrics`, with its first view.
 
-
-def object_cards(rows: dict[str, Tensor], data: PairData) -> list[ObjectCard]:
-    """A card for every object that has pairs among the `rows` of `PoseMetrics`, with its first view."""
+    With `one_answer` a pair there is no success rate.
+    """
     table = data.table
     assert data.images is not None  # evaluation never caches features
     cards = []
@@ -203,9 +165,8 @@ def object_cards(rows: dict[str, Tensor], data: PairData) -> list[ObjectCard]:
         mask = rows["object"] == index
         metrics = summarise(rows["rotation"][mask], rows["translation"][mask], rows["chosen"][mask])
         image = np.asarray(data.images[table.views_of(index)[0]])
-        cards.append(
-            ObjectCard(table.names[index], table.ambiguities[index], image, metrics["R(R)@15"], metrics["SR(R)@30"])
-        )
+        success = None if one_answer else metrics["SR(R)@30"]
+        cards.append(ObjectCard(table.names[index], table.ambiguities[index], image, metrics["R(R)@15"], success))
     return cards
 
 

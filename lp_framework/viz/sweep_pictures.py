@@ -45,31 +45,30 @@ def sweep_figure(table: SweepTable) -> Figure | None:
 
 
 def cost_figure(table: SweepTable) -> Figure | None:
-    """Rotation recall of each solver against its seconds a pair; None where there is one solver, or where the table's
-    own figure has the time.
+    """Rotation recall of each solver against its seconds a pair; None where there is one solver, where there are more
+    rows than colours, or where the table's own figure has the time.
     """
-    groups: dict[str, list[Row]] = {}
-    for row in table.rows:
-        groups.setdefault(str(row.settings.get(SOLVER)), []).append(row)
-    if not 1 < len(groups) <= len(COLOURS) or is_swept(table, "start.count"):
+    solvers = [row.settings.get(SOLVER) for row in table.rows]
+    if len(set(solvers)) < 2 or len(table.rows) > len(COLOURS) or is_swept(table, "start.count"):
         return None
-    panels = []
-    for name in ROTATION_RECALL:
-        curves = []
-        for solver, rows in groups.items():
-            rows = sorted(rows, key=lambda row: row.metrics[SECONDS].mean)
-            stds = [row.metrics[name].std for row in rows]
-            curves.append(
-                Curve(
-                    solver,
-                    np.array([row.metrics[SECONDS].mean for row in rows]),
-                    np.array([row.metrics[name].mean for row in rows]),
-                    np.array([math.nan if std is None else std for std in stds]),
-                    words=[label(_others(row, SOLVER)) for row in rows],
-                )
-            )
-        panels.append(Panel(name, "seconds a pair (log scale)", curves, logarithmic=True))
+    panels = [
+        Panel(name, "seconds a pair (log scale)", [_mark(table, row, name) for row in table.rows], logarithmic=True)
+        for name in ROTATION_RECALL
+    ]
     return curves_figure(panels, "")
+
+
+def _mark(table: SweepTable, row: Row, name: str) -> Curve:
+    """A metric of one row over its seconds, called by its solver and by what differs among the rows of that."""
+    siblings = [each.settings for each in table.rows if each.settings.get(SOLVER) == row.settings.get(SOLVER)]
+    told = {key: value for key, value in row.settings.items() if any(each.get(key) != value for each in siblings)}
+    value = row.metrics[name]
+    return Curve(
+        label({SOLVER: row.settings.get(SOLVER), **told}),
+        np.array([row.metrics[SECONDS].mean]),
+        np.array([value.mean]),
+        np.array([math.nan if value.std is None else value.std]),
+    )
 
 
 def label(settings: Mapping[str, Any]) -> str:

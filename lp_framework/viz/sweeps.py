@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, LogLocator, NullLocator, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, VERMILION, open_frame, styled
@@ -154,6 +154,8 @@ def _across(axes: Axes, panel: Panel) -> None:
     if panel.logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(10, subs=(1.0,), numticks=8))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.margins(x=0.08)
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     else:
         axes.xaxis.set_major_locator(FixedLocator(sorted({float(x) for curve in panel.curves for x in curve.x})))
