@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 import sys
 
@@ -12,6 +14,7 @@ from baseline_stand_ins import FIELD_OF_VIEW, KnownMatcher, know
 from exact_prior import image_of
 from solver_problems import exact_pairs
 from torch import Tensor
+from view_folders import write_objects
 
 from lp_framework import registry
 from lp_framework.data.rendering.raycast import RaycastRenderer
@@ -319,3 +322,18 @@ def test_weights_of_a_matcher_that_cannot_be_had(tmp_path):
     pytest.importorskip("transformers")
     with pytest.raises(UserError, match=f"{tmp_path}: the weights of efficientloftr cannot be had from there"):
         Features(matcher="efficientloftr", weights=str(tmp_path))
+
+
+def test_an_evaluation_has_no_success_rate_and_its_report_leaves_it_open(lp, tmp_path):
+    pytest.importorskip("cv2")
+    write_objects(tmp_path / "views")
+    ran = lp("eval", "solver=features", "data=renderings", "data.path=views", "data.image_size=16", "hydra.run.dir=run")
+    assert ran.status == 0, ran.err
+    result = json.loads((tmp_path / "run" / "results.json").read_text())
+    names = {"R@5", "R@15", "R@30", "R(R)@5", "R(R)@15", "R(R)@30", "rotation_error", "translation_error"}
+    assert set(result["metrics"]) == names == set(next(iter(result["per_object"].values())))
+    ran = lp("report", "runs=run", "objects=all", "hydra.run.dir=report")
+    assert ran.status == 0, ran.err
+    with (tmp_path / "report" / "report.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert row["SR(R)@30"] == "" and float(row["R(R)@30"]) == result["metrics"]["R(R)@30"]

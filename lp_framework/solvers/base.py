@@ -146,6 +146,8 @@ def as_triple(name: str, value: float | Sequence[float]) -> list[float]:
 class Solver(ABC):
     """Estimates relative poses. A subclass's constructor declares what it needs by name: `model`, `prior`."""
 
+    one_answer = False  # it ignores starts and has one answer a pair: a success rate over starts is none
+
     def networks(self) -> list[nn.Module]:
         """The networks that it was given, to be moved to a device."""
         return [part for part in vars(self).values() if isinstance(part, nn.Module)]

@@ -21,6 +21,8 @@ class RelativeCameraSolver(Solver):
     1.4 is where `estimate` puts that of prepared photographs.
     """
 
+    one_answer = True
+
     def __init__(self, reference_radius: float) -> None:
         if not reference_radius > 0:
             raise UserError(f"solver.reference_radius must be positive, got {reference_radius}")
