@@ -18,6 +18,7 @@ COMMANDS = {  # the module of a command is lp_framework.commands.NAME
     "estimate": "Estimate the camera poses of photographs of one object",
     "views": "Draw novel views around an object by a prior",
     "landscape": "Show how a prior's energy runs around each object, and whether its least is at the truth",
+    "figure": "Draw a figure of the paper of your own data, prior and models",
     "render": "Render meshes to views on disk",
     "convert": "Turn a Zero123 checkpoint, or a training run, into a folder of safetensors that loads in seconds",
     "bench": "Measure speed and memory against plain alternatives, side by side",
@@ -64,7 +65,7 @@ def main() -> int:
     except UserError as error:
         if full_error:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return 1 if type(error) is UserError else 2
     return 0
 

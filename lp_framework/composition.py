@@ -28,6 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from lp_framework import registry
+from lp_framework.constructors import outline
 from lp_framework.errors import UserError, nearest
 
 _Names = list[str]  # the method `list` of Hydra's interface hides the type
@@ -70,7 +71,9 @@ def node(group: str, choice: str, folders: Sequence[Path]) -> DictConfig:
             f"a file of another name is a preset and says of what, as in 'name: {known[0] if known else 'NAME'}'"
         )
     with_defaults = any("defaults" in values for _, values in files)
-    result = OmegaConf.structured(_schema(registry.get(group, name), name, with_defaults))
+    # A built-in's settings are read from its source: `--help`, and a mistake, then come without importing torch.
+    cls = outline((group, name)) or registry.get(group, name)
+    result = OmegaConf.structured(_schema(cls, name, with_defaults))
     assert isinstance(result, DictConfig)
     for file, values in files:
         for key in map(str, values):

@@ -8,10 +8,13 @@ import importlib
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
@@ -42,6 +45,13 @@ WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
     *("--experimental-rerun", "--info", "-i"),
 )
+LAUNCHER = "hydra/launcher/"
+LAUNCHERS = {  # those of Hydra's plugins, with the extra that brings each
+    **{"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps"},
+    **{"ray": "ray", "ray_aws": "ray"},
+}
+COMPOSING = ("hydra._internal.config_loader_impl", "hydra.core.override_parser.overrides_parser")  # modules of Hydra
+SHOWING = ("show_cfg", "show_info")  # functions of Hydra
 HYDRA_VALUE_ERRORS = ("Config group override must be", "Only one of --run", "The --resolve flag")
 
 
@@ -55,11 +65,11 @@ def run(command: str, arguments: Sequence[str]) -> None:
     The command is `lp_framework.commands.COMMAND.run(config)`, imported only when it runs. Raises `UsageError` for
     arguments that do not compose, `UserError` for bad input met while running; in a sweep the other jobs go on first.
     """
-    options = _options(arguments)
     arguments = _overrides_first(arguments)
+    options = _options(arguments)
     try:
         registry.discover(_plugin_folders(arguments))
-    except OverrideParseException as error:
+    except HydraException as error:
         raise UsageError(_explain(error)) from error
     for origin, failure in registry.failures().items():
         print(f"warning: plugin {origin} could not be loaded: {failure}", file=sys.stderr)
@@ -73,10 +83,14 @@ def run(command: str, arguments: Sequence[str]) -> None:
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command)(task)()
     except (HydraException, YAMLError, MissingMandatoryValue, InterpolationResolutionError) as error:
         raise UsageError(_explain(error)) from error
-    except ValueError as error:
-        if not str(error).startswith(HYDRA_VALUE_ERRORS):
-            raise
-        raise UsageError(one_line(error)) from error
+    except UserError:
+        raise
+    except Exception as error:
+        if str(error).startswith(HYDRA_VALUE_ERRORS):
+            raise UsageError(one_line(error)) from error
+        if _while_composing(error):
+            raise UsageError(f"this makes no configuration ({type(error).__name__}: {one_line(error)})") from error
+        raise
     if failed:
         raise failed[0]
 
@@ -136,18 +150,31 @@ def _forget_processes(environment: dict[str, str]) -> None:
         distributed.destroy_process_group()
 
 
+def _while_composing(error: Exception) -> bool:
+    """Whether an exception comes from Hydra's composing or showing a configuration, and not from a job."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(frame.f_globals.get("__name__") in COMPOSING or frame.f_code.co_name in SHOWING for frame in frames)
+
+
 def _options(arguments: Sequence[str]) -> dict[str, str]:
     """Those of Hydra's options that say where configs are; `UsageError` for a misspelt option."""
     for argument in arguments:
         option = argument.partition("=")[0]
         if option.startswith("-") and option not in OPTIONS:
             raise UsageError(f"there is no option '{option}'{nearest(option, OPTIONS)}")
+    hydras = get_args_parser()
+    hydras.error = _usage  # type: ignore[method-assign]  # instead of a page and an exit
+    hydras.parse_args([argument for argument in arguments if argument != "--version"])
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config-dir", "-cd")
     parser.add_argument("--config-path", "-cp")
     parser.add_argument("--config-name", "-cn")
     known = vars(parser.parse_known_args(arguments)[0])
     return {f"--{key.replace('_', '-')}": value for key, value in known.items() if value is not None}
+
+
+def _usage(message: str) -> NoReturn:
+    raise UsageError(f"{message} (--help shows the options)")
 
 
 def _overrides_first(arguments: Sequence[str]) -> list[str]:
@@ -175,6 +202,9 @@ def _plugin_folders(arguments: Sequence[str]) -> list[str]:
 def _explain(error: Exception) -> str:
     cause = error.__cause__ or error.__context__
     match error:
+        case MissingConfigException(missing_cfg_file=str(file)) if file.removeprefix(LAUNCHER) in LAUNCHERS:
+            launcher = file.removeprefix(LAUNCHER)
+            return f"hydra/launcher={launcher} is not installed: pip install 'lp_framework[{LAUNCHERS[launcher]}]'"
         case MissingConfigException(missing_cfg_file=str(file), options=options) if options is not None:
             group, _, choice = file.rpartition("/")
             return f"{group}={choice}: there is no {group} '{choice}'{nearest(choice, options)} ({_known(options)})"

@@ -30,6 +30,7 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -285,7 +286,7 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
     """
     if _state.loading is not None:  # a plugin that asks for names while it is being imported
         return
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+    for point in _entry_points():
         if _first_time(f"entry point {point.name}={point.value}"):
             package = f"{point.dist.name} {point.dist.version}" if point.dist else point.name
             _load_entry_point(point.module, f"package {package}")
@@ -300,6 +301,12 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
             raise UserError(f"plugins=[{folder}]: neither this folder nor a folder in it holds Python files")
         if path not in _state.folders:
             _state.folders.append(path)
+
+
+@cache
+def _entry_points() -> tuple[importlib.metadata.EntryPoint, ...]:
+    """Looked for once: that means to read the metadata of every package that is installed."""
+    return tuple(importlib.metadata.entry_points(group=ENTRY_POINTS))
 
 
 def _first_time(plugin: str) -> bool:

@@ -12,10 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from lp_framework import cli, registry, torchvision_ops
 
 torchvision_ops.install()
+# The same examples everywhere and always; `--hypothesis-profile=default` looks for new ones.
+settings.register_profile("same", derandomize=True, database=None, deadline=None)
+settings.load_profile("same")
 ROOT = Path(__file__).parents[1]
 
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import slurm_stand_in
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from tiny_runs import Commands, Ran
@@ -50,8 +51,9 @@ def plain_noise(gamma):
         ("score_energy", (), {("two_stage", "runs/score"), ("two_stage", "runs/energy")}),
         ("stages", ("views=2,8",), {(first, second, views) for first, second in ((True, True), (True, False),
                                                                                  (False, True)) for views in (2, 8)}),
-        ("methods", (), {(solver, "grid") for solver in (
-            "langevin", "ifusion", "id_pose", "two_stage", "gauss_newton")}),
+        ("methods", (), {(solver, noise, "grid") for solver, noise in (
+            ("langevin", (0.0, 0.3, 0.0)), ("ifusion", None), ("id_pose", None), ("two_stage", (0.0, 0.3, 0.0)),
+            ("two_stage", 0.0), ("gauss_newton", 0.0), ("features", None))}),
     ],
 )  # fmt: skip
 def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, narrowed, varies):
@@ -63,7 +65,7 @@ def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, n
         "priors": lambda c: (c.solver.name, c.prior.name),
         "score_energy": lambda c: (c.solver.name, c.checkpoint),
         "stages": lambda c: (c.solver.first_stage, c.solver.second_stage, c.views),
-        "methods": lambda c: (c.solver.name, c.start.name),
+        "methods": lambda c: (c.solver.name, plain_noise(c.solver.get("gamma")), c.start.name),
     }[experiment]
     assert len(jobs) == len(varies) and {keys(config) for config, _, _ in jobs} == varies
     assert {config.seed for config, _, _ in jobs} == {5} and {config.data.name for config, _, _ in jobs} == {"toy"}
@@ -73,8 +75,8 @@ def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, n
 
 
 def test_every_table_of_the_paper_has_its_experiment_over_three_seeds():
-    for table in paper_tables():
-        file = ROOT / "conf" / "experiment" / f"{table.experiment}.yaml"
+    for experiment in (name for table in paper_tables() for name in table.experiments):
+        file = ROOT / "conf" / "experiment" / f"{experiment}.yaml"
         params = yaml.safe_load(file.read_text())["hydra"]["sweeper"]["params"]
         assert params["seed"] == "0,1,2"
 
@@ -197,14 +199,20 @@ def test_an_experiment_goes_on_in_its_own_folder(commands, monkeypatch):
 @pytest.mark.parametrize(
     ("package", "launcher", "gammas"),
     [
-        ("hydra_plugins.hydra_joblib_launcher", ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"), (0, 0.3)),
-        ("hydra_plugins.hydra_submitit_launcher", ("hydra/launcher=submitit_local",), (0.3,)),
+        ("joblib", ("hydra/launcher=side_by_side",), (0, 0.3)),
+        ("submitit", ("hydra/launcher=submitit_local",), (0.3,)),
+        ("submitit", ("hydra/launcher=slurm", "hydra.launcher.gpus_per_node=null"), (0, 0.3)),
+        ("ray", ("hydra/launcher=ray_cluster", "hydra.launcher.ray.remote.num_cpus=1"), (0, 0.3)),
     ],
+    ids=lambda value: value[0].partition("=")[2] if isinstance(value, tuple) and isinstance(value[0], str) else "",
 )
 def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice(
     commands, monkeypatch, package, launcher, gammas
 ):
-    pytest.importorskip(package, reason="the launchers are in the extra sweeps")
+    pytest.importorskip(f"hydra_plugins.hydra_{package}_launcher", reason="the launchers are in extras, sweeps and ray")
+    if not (commands.folder / "slurm").exists():
+        slurm_stand_in.install(commands.folder / "slurm")
+    monkeypatch.setenv("PATH", f"{commands.folder / 'slurm'}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setattr("lp_framework.viz.pictures.save_pictures", None)  # the plugin changes it here, too
     quick = commands.folder / "plugins" / "tmp_tiny_quick"
     quick.mkdir(exist_ok=True)
@@ -218,6 +226,38 @@ def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice
     assert tuple(result(folder)["config"]["solver"]["gamma"] for folder in folders) == gammas
     again = commands.here("unused", "eval", *sweep)  # in this process, but the same sweep
     assert again.status == 0 and again.out.count("skipped, finished before: ") == len(gammas)
+
+
+def test_what_is_asked_of_slurm(tmp_path, monkeypatch):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="the launchers are in the extra sweeps")
+    from submitit.slurm.slurm import SlurmExecutor
+
+    monkeypatch.setenv("PATH", str(slurm_stand_in.install(tmp_path / "slurm")))
+    config = yaml.safe_load((ROOT / "conf" / "hydra" / "launcher" / "slurm.yaml").read_text())
+    names = SlurmExecutor._equivalence_dict()
+    script = SlurmExecutor("folder")
+    script.update_parameters(
+        **{
+            names.get(key, key): f"{value}GB" if key == "mem_gb" else value
+            for key, value in config.items()
+            if key not in ("defaults", "max_num_timeout", "partition")
+        }
+    )
+    asked = script._make_submission_file_text("command", "uid")
+    for line in ("--gpus-per-node=1", "--cpus-per-task=4", "--mem=24GB", "--time=240"):
+        assert f"#SBATCH {line}\n" in asked
+
+
+@pytest.mark.parametrize(("launcher", "extra"), [("joblib", "sweeps"), ("slurm", "sweeps"), ("ray_cluster", "ray")])
+def test_a_launcher_that_is_not_installed(lp, monkeypatch, launcher, extra):
+    from hydra.core.config_store import ConfigStore
+    from hydra.core.plugins import Plugins
+
+    Plugins.instance()  # the launchers put their configs there
+    monkeypatch.setitem(ConfigStore.instance().repo["hydra"], "launcher", {})
+    ran = lp("eval", f"hydra/launcher={launcher}", "--cfg", "job")
+    name = {"slurm": "submitit_slurm", "ray_cluster": "ray"}.get(launcher, launcher)
+    assert ran.error == f"hydra/launcher={name} is not installed: pip install 'lp_framework[{extra}]'"
 
 
 # A solver of a plugin, and no pictures, which take most of a run's time.

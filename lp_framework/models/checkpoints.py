@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from lp_framework import registry
 from lp_framework.errors import UserError
-from lp_framework.models.model_folder import RECIPE, WEIGHTS, read_model_folder
+from lp_framework.models.model_folder import RECIPE, WEIGHTS, is_recipe, read_model_folder
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import TrainedModule
 
@@ -43,13 +42,20 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such checkpoint") from None
-    except (OSError, RuntimeError, EOFError, UnpicklingError, ValueError, KeyError) as error:
+    except Exception as error:  # a damaged pickle fails in any way
         raise UserError(
             f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
         ) from error
-    if not isinstance(checkpoint, dict) or RECIPE not in checkpoint or "state_dict" not in checkpoint:
+    if not isinstance(checkpoint, dict) or not is_recipe(checkpoint.get(RECIPE)) or not _weights_in(checkpoint):
         raise UserError(f"{path}: is a checkpoint of something else; one that `lp train` wrote is wanted")
     return checkpoint
+
+
+def _weights_in(checkpoint: Mapping[str, Any]) -> bool:
+    weights = checkpoint.get("state_dict")
+    return isinstance(weights, dict) and all(
+        isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items()
+    )
 
 
 def find_checkpoint(path: str | Path) -> Path:
@@ -100,6 +106,9 @@ def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
         model.on_load_checkpoint(checkpoint)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UserError(f"{file}: describes no model that can be built ({reason})") from error
     kind = recipe["model"]["name"]
     try:
         missing, unexpected = model.load_state_dict(checkpoint["state_dict"], strict=False)

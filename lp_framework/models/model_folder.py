@@ -52,13 +52,24 @@ def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtyp
         raise UserError(f"{folder}: cannot be written: {'the disk is full' if full else error}") from error
 
 
+def is_recipe(value: Any) -> bool:
+    """Whether a value can be the configs of model and backbone: settings by name, `name` among them."""
+    return isinstance(value, dict) and all(
+        isinstance(value.get(group), dict)
+        and isinstance(value[group].get("name"), str)
+        and all(isinstance(key, str) for key in value[group])
+        for group in ("model", "backbone")
+    )
+
+
 def read_model_folder(folder: Path) -> dict[str, Any]:
     """The checkpoint that a folder holds, weights in float32; `UserError` naming the file that is at fault."""
     try:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-        recipe = {"model": dict(config["model"]), "backbone": dict(config["backbone"])}
-        trunk = config["trunk"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        recipe, trunk = {"model": config["model"], "backbone": config["backbone"]}, config["trunk"]
+        if not is_recipe(recipe):
+            raise ValueError("model and backbone have no names")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{folder / CONFIG}: is not the description of a trained model ({error})") from error
     try:
         with safe_open(folder / WEIGHTS, framework="pt") as file:

@@ -66,7 +66,7 @@ def _config(file: Path) -> dict[str, Any]:
         config = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{file}: there is no such file; a folder of Zero123 in diffusers' layout has it") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{file}: cannot be read as JSON: {str(error).splitlines()[0]}") from error
     if not isinstance(config, dict):
         raise UserError(f"{file}: is no configuration, a JSON object is wanted")

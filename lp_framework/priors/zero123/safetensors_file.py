@@ -40,7 +40,7 @@ def read_safetensors(path: Path) -> dict[str, StoredTensor]:
                 tensors[name] = StoredTensor(path, start + first, dtype, shape, _row_major(shape))
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: is no safetensors file, or is cut short; download it again") from error
     return tensors
 

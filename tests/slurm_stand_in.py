@@ -1,0 +1,45 @@
+"""Slurm's commands as far as submitit uses them, for machines without Slurm: jobs of an array run at once, here."""
+
+from __future__ import annotations
+
+import sys
+import textwrap
+from pathlib import Path
+
+ARRAY = 4200  # the array's number
+# Starts the script for every task of the array, as Slurm would on a node, and returns at once.
+SBATCH = f"""
+    import os, re, subprocess, sys
+
+    script = sys.argv[-1]
+    first, last = map(int, re.search(r"^#SBATCH --array=(\\d+)-(\\d+)%", open(script).read(), re.MULTILINE).groups())
+    for task in range(first, last + 1):
+        job = {{"JOB_ID": {ARRAY} + 1 + task, "ARRAY_JOB_ID": {ARRAY}, "ARRAY_TASK_ID": task, "JOB_NAME": "eval"}}
+        place = {{"NTASKS": 1, "JOB_NUM_NODES": 1, "NNODES": 1, "NODEID": 0, "PROCID": 0, "LOCALID": 0}}
+        slurm = {{f"SLURM_{{key}}": str(value) for key, value in (job | place).items()}}
+        environment = os.environ | slurm | {{"SLURM_JOB_NODELIST": "node0", "SLURMD_NODENAME": "node0"}}
+        subprocess.Popen(["bash", script], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    print("Submitted batch job {ARRAY}")
+"""
+SRUN = """
+    import os, sys
+
+    command = sys.argv[1:]
+    while command[0].startswith("-"):
+        command = command[2 if command[0] in ("--output", "--error") else 1 :]
+    os.execvp(command[0], command)
+"""
+SACCT = f"""
+    print("JobID|State|NodeList")
+    for task in range(8):
+        print(f"{ARRAY}_{{task}}|RUNNING|node0")
+"""
+
+
+def install(folder: Path) -> Path:
+    """Write the commands into `folder`, which then goes first in PATH."""
+    folder.mkdir()
+    for name, source in (("sbatch", SBATCH), ("srun", SRUN), ("sacct", SACCT)):
+        (folder / name).write_text(f"#!{sys.executable}\n{textwrap.dedent(source)}")
+        (folder / name).chmod(0o755)
+    return folder
