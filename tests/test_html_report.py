@@ -408,9 +408,11 @@ MISSING = [
 ]
 with_browser = pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-PATIENCE = 60_000  # milliseconds: without a GPU and on a busy machine relief takes long to draw
-DRAWN = """[...document.querySelectorAll('.plot')].every(
-    (plot) => plot.classList.contains('drawn') || !plot.checkVisibility())"""
+PATIENCE = 180_000  # milliseconds: without a GPU and on a busy machine relief takes long to draw
+DRAWN = """(place) => {
+    const plot = document.querySelectorAll('.plot')[place];
+    return plot.classList.contains('drawn') || !plot.checkVisibility();
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -448,11 +450,10 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
 
 
 def scroll_through(page: Any) -> None:
-    """Down the page until every plot in sight is drawn."""
+    """Down the page, so that every plot in sight is drawn."""
     for place in range(page.locator(".plot").count()):
         page.evaluate("(place) => document.querySelectorAll('.plot')[place].scrollIntoView()", place)
-        page.wait_for_timeout(50)
-    page.wait_for_function(DRAWN)
+        page.wait_for_function(DRAWN, arg=place)
 
 
 def colours(page: Any, selector: str) -> int:
