@@ -83,6 +83,7 @@ def test_a_run_leaves_checkpoints_config_metrics_and_its_log(score):
     for name in ("checkpoints/best.ckpt", "checkpoints/last.ckpt", "config.yaml", "train.log", "training.json"):
         assert (score.folder / name).is_file(), name
     summary = score.json("training.json")
+    assert len(summary["objects"]) == len(set(summary["objects"])) > 1
     assert summary["epochs"] == 3
     assert summary["model"]["name"] == "score"
     assert summary["backbone"]["name"] == "tmp_tiny"

@@ -35,6 +35,7 @@ from lp_framework.commands.building import (
     versions,
 )
 from lp_framework.commands.finished import with_overrides
+from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, KeepRecipe, read_checkpoint
@@ -74,7 +75,7 @@ def run(config: DictConfig) -> None:
             keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
     trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
     if trainer.is_global_zero:
-        report(trainer, folder, config, recipe, data.fingerprint("all_train"))
+        report(trainer, folder, config, recipe, data)
 
 
 def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -157,14 +158,15 @@ def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
     writer.metrics_keys = columns
 
 
-def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any], fingerprint: str) -> None:
-    """`REPORT` and the closing lines; `fingerprint` is that of all training views."""
+def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any], data: PairDataModule) -> None:
+    """`REPORT` and the closing lines; the fingerprint is that of all training views."""
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
     write_json(
         folder / REPORT,
         {**recipe, "seed": config.seed, "epochs": trainer.current_epoch, "steps": trainer.global_step,
-         "final": losses, "fingerprints": {"views": fingerprint}, "versions": versions()},
+         "final": losses, "objects": data.table("train").names,
+         "fingerprints": {"views": data.fingerprint("all_train")}, "versions": versions()},
     )  # fmt: skip
     console = Console(soft_wrap=True, highlight=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
