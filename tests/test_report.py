@@ -58,7 +58,7 @@ def test_a_run_without_hydras_folder_has_no_experiment(tmp_path):
     [
         ("", "damaged: .*results.json cannot be read"),
         ('{"metrics": {"R@5": 0.', "damaged: .*results.json cannot be read"),
-        ('{"weight": 3}', "is not the result of an evaluation \\(KeyError\\('config'\\)"),
+        ('{"weight": 3}', "is not the result of an evaluation, or one of another version"),
         ("[1, 2]", "is not the result of an evaluation"),
         (None, "unfinished: no results.json"),
     ],
@@ -348,3 +348,12 @@ def test_a_mistake_is_one_sentence(lp, tmp_path, arguments, sentence):
     write_result(tmp_path / "good" / "a")
     ran = lp("report", *arguments, "hydra.run.dir=out")
     assert ran.status == 1 and ran.error.startswith(sentence)
+
+
+def test_what_changes_no_result_is_no_setting(lp, tmp_path):
+    for seed, batch_pairs in ((0, None), (1, 20)):
+        write_result(tmp_path / "runs" / str(seed), {"seed": seed, "batch_pairs": batch_pairs, "resume": None})
+    assert lp("report", "runs=runs", "hydra.run.dir=report").status == 0
+    (table,) = json.loads((tmp_path / "report" / "report.json").read_text())["tables"]
+    (row,) = table["rows"]
+    assert sorted(row["seeds"]) == [0, 1] and not any("batch_pairs" in column for column in table["columns"])

@@ -123,6 +123,14 @@ def run_folder() -> Path:
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
+def warn_of_photographs() -> None:
+    """Say that the prior that ships knows no photographs."""
+    log.warning(
+        "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing. "
+        "For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER"
+    )
+
+
 def plain(config: DictConfig) -> dict[str, Any]:
     """A config as dicts, lists, names and numbers."""
     values: Any = OmegaConf.to_container(config, resolve=True)

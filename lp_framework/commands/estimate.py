@@ -20,7 +20,15 @@ from torch import Tensor
 
 from lp_framework import registry
 from lp_framework.api import image_batch, move
-from lp_framework.commands.building import build_solver, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.building import (
+    build_solver,
+    orderly_console,
+    plain,
+    run_folder,
+    seed_run,
+    versions,
+    warn_of_photographs,
+)
 from lp_framework.commands.device import choose_device
 from lp_framework.data.camera_files import colmap_model, nerf_transforms
 from lp_framework.data.photographs import (
@@ -117,10 +125,7 @@ def run(config: DictConfig) -> None:
     _write(folder, estimated, prepared, result)
     _print(folder, estimated)
     if knows_little(config):
-        log.warning(
-            "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing. "
-            "For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER"
-        )
+        warn_of_photographs()
 
 
 def knows_little(config: DictConfig) -> bool:

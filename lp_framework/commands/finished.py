@@ -52,7 +52,13 @@ def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[
     Raises `UserError` where there is none, and for `overrides` of other settings.
     """
     if (folder / RESULT).is_file():
-        raise UserError(f"resume={folder}: has solved all of its pairs, {folder / RESULT} has the results")
+        try:
+            json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise UserError(
+                f"{folder / RESULT}: is damaged ({error}), and nothing is left to go on from; evaluate anew"
+            ) from error
+        raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
     subject = unfinished(folder)
     if subject is None:
         raise UserError(f"resume={folder}: holds no {FOLDER} evaluation to go on from; give the folder of one")

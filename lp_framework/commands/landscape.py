@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich import box
 from rich.console import Console
@@ -33,6 +34,7 @@ from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.style import save_figure
 
 PAIRS = 8  # an object, for its ambiguity
+OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview has no use for
 
 
 @orderly_console()
@@ -59,6 +61,11 @@ def check(config: DictConfig) -> None:
     steps = list(config.timesteps) if isinstance(config.timesteps, Sequence) else []
     if not steps or not all(isinstance(each, int) for each in steps):
         raise UserError(f"timesteps must list whole numbers, one at least, got {config.timesteps}")
+    if config.object is None and config.images is None:
+        given = (override.partition("=")[0] for override in HydraConfig.get().overrides.task)
+        for key in given:
+            if key.partition(".")[0] in OF_A_PAIR:
+                raise UserError(f"{key} is of the landscape of a pair; give object=NAME or images=[A.png,B.png], too")
     if config.object is not None and config.images is not None:
         raise UserError("give object=NAME for views of the data set or images=[A.png,B.png], not both")
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lp_framework import registry
 from lp_framework.api import image_batch, move
-from lp_framework.commands.building import build_data, build_solver, plain, versions
+from lp_framework.commands.building import build_data, build_solver, plain, versions, warn_of_photographs
 from lp_framework.commands.device import choose_device
 from lp_framework.data.photographs import BackgroundRemover, mask_files, photograph_files, prepare, read_image
 from lp_framework.errors import UserError
@@ -155,6 +155,8 @@ def photographs(config: DictConfig, device: torch.device) -> Shown:
         prepare(read_image(file), str(file), None if mask is None else read_image(mask), remover, config.crop)
         for file, mask in zip(files, masks, strict=True)
     ]
+    if config.prior.name == "tiny" and config.prior.path is None:
+        warn_of_photographs()
     index = torch.arange(2, device=device)
     pairs = Pairs(image_batch(prepared).to(device), index[:1], index[1:], ids=index[:1])
     return Shown(f"{files[0].name} and {files[1].name}", [str(file) for file in files], pairs, None, None)

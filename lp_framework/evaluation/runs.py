@@ -93,7 +93,7 @@ def read_run(folder: Path) -> Run:
     except (OSError, ValueError, RecursionError) as error:  # of JSON, too
         raise UserError(f"damaged: {file} cannot be read ({error})") from error
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise UserError(f"damaged: {file} is not the result of an evaluation ({error!r})") from error
+        raise UserError(f"damaged: {file} is not the result of an evaluation, or one of another version") from error
 
 
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -190,8 +190,10 @@ def _metrics(values: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _is_left_aside(key: str) -> bool:
-    """Whether a key is not compared: seeds, plugin folders, and the checkpoint, which has `checkpoint_setting`."""
-    return key in ("plugins", "checkpoint", "seed") or key.endswith(".seed")
+    """Whether a key is not compared: seeds, plugin folders, what changes no result, and the checkpoint, which has
+    `checkpoint_setting`.
+    """
+    return key in ("plugins", "checkpoint", "seed", "batch_pairs", "resume") or key.endswith(".seed")
 
 
 def _number(value: Any) -> Any:

@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
+from lp_framework.evaluation.ambiguity import FLAT
 from lp_framework.evaluation.landscape import Landscape
 from lp_framework.viz import fields
 from lp_framework.viz.fields import CHOSEN_MARK, END_MARK, START_MARK, TRUTH_MARK, FieldMap
@@ -168,7 +169,7 @@ def draw_map(
     relief = axes.pcolormesh(longitude, latitude, energy, cmap=RELIEF, shading="gouraud", zorder=0)
     if np.nanmax(energy) > np.nanmin(energy):
         axes.contour(longitude, latitude, energy, levels=LEVELS, colors="white", linewidths=0.4, alpha=0.55, zorder=0.5)
-    for minimum in landscape.minima():
+    for minimum in landscape.minima() if landscape.flatness() < FLAT else []:  # of a plateau, any place would do
         axes.plot(
             math.degrees(minimum.longitude), math.degrees(minimum.latitude), linestyle="none", zorder=2,
             **MINIMUM_MARK,

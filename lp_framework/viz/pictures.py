@@ -66,10 +66,9 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
         index = int(objects[pick.row])
         start = chosen[pick.row]
         title = f"{table.names[index].replace('_', ' ')} ({table.ambiguities[index]})"
-        note = (
-            f"{pick.reason}: rotation error {rotation[pick.row, start]:.1f}°, "
-            f"translation error {translation[pick.row, start]:.2f}"
-        )
+        degrees, distance = rotation[pick.row, start], translation[pick.row, start]
+        off = "no answer" if np.isnan(degrees) else f"rotation error {degrees:.1f}°, translation error {distance:.2f}"
+        note = f"{pick.reason}: {off}"
         figure = field_figure(*pair_contents(evaluation, data[views]), title, note)
         written += save_figure(figure, folder / f"field_{number}")
     return [*(file for file in written if file.suffix == ".png"), *save_summaries(folder, evaluation, data)]
