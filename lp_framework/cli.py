@@ -17,7 +17,7 @@ COMMANDS = {  # the module of a command is lp_framework.commands.NAME
     "report": "Gather finished evaluations into tables and figures, beside the paper's numbers",
     "estimate": "Estimate the camera poses of photographs of one object",
     "views": "Draw novel views around an object by a prior",
-    "landscape": "Show how a prior's energy runs around each object, and whether its least is at the truth",
+    "landscape": "Show a prior's energy over relative poses: of a pair of views, or around each object",
     "figure": "Draw a figure of the paper of your own data, prior and models",
     "render": "Render meshes to views on disk",
     "convert": "Turn a Zero123 checkpoint, or a training run, into a folder of safetensors that loads in seconds",

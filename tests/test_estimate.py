@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 import lp_framework
-from lp_framework.commands.estimate import knows_little
+from lp_framework.commands.estimate import warn_of_prior
 from lp_framework.composition import conf_dir
 from lp_framework.data.photographs import on_white, prepare
 from lp_framework.errors import UserError
@@ -303,10 +303,12 @@ def test_it_works_out_of_the_box_and_names_mean_what_they_do_elsewhere():
     torch.testing.assert_close(built.poses, solution.poses)
 
 
-def test_who_rests_on_the_prior_that_ships_is_told(lp, clean_registry):
+def test_who_rests_on_the_prior_that_ships_is_told(lp, clean_registry, caplog):
     def told(*overrides: str) -> bool:
         printed = lp("estimate", "images=x", "--cfg", "job", *overrides).out
-        return knows_little(OmegaConf.create(printed))
+        caplog.clear()
+        warn_of_prior(OmegaConf.create(printed))
+        return "prior=tiny as it ships knows the twelve embedded objects" in caplog.text
 
     assert told() and told("solver=ifusion")
     assert not told("prior.path=mine") and not told("prior=zero123xl") and not told("solver=langevin")

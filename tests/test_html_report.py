@@ -44,6 +44,7 @@ from lp_framework.viz.html.runs import run_folders, run_kind
 
 LARGEST = 10_000_000  # bytes
 VOID = {"meta", "link", "img", "input", "br"}
+DEEP, DEEP_YAML = "[" * 100_000, "a: " + "[" * 3000  # deeper than their readers go
 
 
 class Page(HTMLParser):
@@ -121,6 +122,7 @@ def test_saving_replaces_the_examples_of_an_earlier_run(tmp_path):
         (lambda folder: (folder / "0_query.png").unlink(), "there is no such file"),
         (lambda folder: (folder / "0_query.png").write_bytes(b"\x89PNG"), "is damaged"),
         (lambda folder: (folder / FILE).write_text("{"), "is damaged"),
+        (lambda folder: (folder / FILE).write_text(DEEP), "is damaged"),
         (lambda folder: (folder / FILE).write_text('{"examples": [{"object": "a"}]}'), "is damaged"),
         (lambda folder: replace(folder, '"chosen": 1', '"chosen": 9'), "chosen is 9 of 4"),
         (lambda folder: replace(folder, '"ends": [[', '"ends": [[1, '), "is damaged"),
@@ -301,17 +303,22 @@ def test_the_data_of_a_page_are_those_of_the_run(tmp_path):
         ("eval", "pictures/examples/0_query.png", "no image"),
         ("eval", "results.json", '{"metrics": 3}'),
         ("eval", "results.json", "{"),
+        ("eval", "results.json", DEEP),
+        ("eval", "pictures/examples/examples.json", DEEP),
         ("train", "metrics.csv", None),
         ("train", "metrics.csv", "step,train/loss\nx,y\n"),
         ("train", "training.json", "[]"),
         ("train", "config.yaml", "a: ["),
+        ("train", "config.yaml", DEEP_YAML),
         ("estimate", "poses.csv", "file,image\na,b\n"),
         ("estimate", "images/000.png", None),
         ("estimate", "results.json", None),
         ("landscape", "azimuth.json", "{}"),
+        ("landscape", "azimuth.json", DEEP),
         ("pair", "pictures/examples/examples.json", "7"),
         ("pair", "landscape.png", None),
     ],
+    ids=lambda each: str(each)[:40],
 )
 def test_what_is_missing_or_damaged_is_said_and_the_rest_is_shown(kind, file, content, tmp_path):
     folder = WRITERS[kind](tmp_path / "run")

@@ -15,7 +15,7 @@ from lp_framework.benchmarks.section import Figure, Section
 from lp_framework.data.pairs import PairData
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior, ViewCode
-from lp_framework.solvers.base import Pairs, Solution
+from lp_framework.solvers.base import Pairs, Solution, pairs_of
 from lp_framework.solvers.gauss_newton import GaussNewton
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
@@ -80,10 +80,7 @@ def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
     """So many of the ordered pairs of views, spread evenly over the objects."""
     every = views.table.pairs("ordered")
     chosen = every[np.linspace(0, len(every), min(count, len(every)), endpoint=False, dtype=int)]
-    batch = views[chosen]
-    assert batch.images is not None  # no features are cached here
-    ids = views.table.pair_ids(batch.pairs)
-    return Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
+    return pairs_of(views[chosen], views.table, device)
 
 
 def measure(

@@ -13,12 +13,11 @@ from torch import nn
 from lp_framework.benchmarks.arithmetic import Arithmetic, counted, peak
 from lp_framework.benchmarks.contest import Match, Work, compete
 from lp_framework.benchmarks.memory import peak_bytes
-from lp_framework.benchmarks.second_stage import ARCHITECTURES, TIMESTEP, Architecture, Batched
+from lp_framework.benchmarks.second_stage import ARCHITECTURES, TIMESTEP, Architecture, Batched, random_pair
 from lp_framework.benchmarks.section import Figure, Section
 from lp_framework.errors import UserError
 from lp_framework.priors.zero123.networks import DTYPES, Networks
 from lp_framework.priors.zero123.prior import Zero123Prior
-from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
 
@@ -63,12 +62,10 @@ class Precision:
         variants = {words: Variant.named(words) for words in self.variants}
         with self.device:
             networks = Networks(ARCHITECTURES[self.architecture])
-        index = torch.arange(2, device=self.device)
-        images = torch.rand(2, 3, 256, 256, device=self.device) * 2 - 1
-        pair = Pairs(images, index[:1], index[1:], ids=index[:1])
+        pair = random_pair(self.device)
         priors = {words: self.prior(networks, variant) for words, variant in variants.items()}
         plain = Zero123Prior(networks, max_batch=self.max_batch).to(self.device)
-        codes = plain.encode(images)
+        codes = plain.encode(pair.images)
         starts = Ring(self.starts).make(pair.ids, seed=0)
         runners = {words: Batched(PairEnergy(prior, pair, 0, codes), starts) for words, prior in priors.items()}
         runners[PLAIN] = Batched(PairEnergy(plain, pair, 0, codes), starts)
@@ -126,8 +123,7 @@ class Precision:
         meta = torch.device("meta")
         with meta:
             prior = Zero123Prior(Networks(ARCHITECTURES[self.architecture]))
-        index = torch.arange(2, device=meta)
-        pair = Pairs(torch.empty(2, 3, 256, 256, device=meta), index[:1], index[1:], ids=index[:1])
+        pair = random_pair(meta)
         return counted(Batched(PairEnergy(prior, pair, seed=0), Ring(self.starts).make(pair.ids, seed=0)).step)
 
     def work(self, runner: Batched) -> Work:

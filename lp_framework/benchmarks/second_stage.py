@@ -27,7 +27,7 @@ from lp_framework.priors.zero123.networks import (
     unet_config,
     vae_config,
 )
-from lp_framework.priors.zero123.prior import Zero123Prior
+from lp_framework.priors.zero123.prior import IMAGE_SIZE, Zero123Prior
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
@@ -44,6 +44,12 @@ NARROW: Configs = {  # the same layers, few and narrow: to try the measurement i
     "image_encoder": clip_config(width=64, layers=1, patch=32, image_size=224, projection=32),
 }
 ARCHITECTURES: Mapping[Architecture, Configs] = {"published": PUBLISHED, "narrow": NARROW}
+
+
+def random_pair(device: torch.device) -> Pairs:
+    """A pair of random images of Zero123's size."""
+    index = torch.arange(2, device=device)
+    return Pairs(torch.rand(2, 3, IMAGE_SIZE, IMAGE_SIZE, device=device) * 2 - 1, index[:1], index[1:], ids=index[:1])
 
 
 class Batched:
@@ -141,7 +147,7 @@ class SecondStage:
         """The section after every stretch of either contender."""
         work = self.work()
         batch_prior, loop_prior = self.priors()
-        pair = self.pair()
+        pair = random_pair(self.device)
         began = time.perf_counter()
         energy = PairEnergy(batch_prior, pair, seed=0)
         synchronise(self.device)
@@ -167,17 +173,11 @@ class SecondStage:
                     measured[count][name].seconds.append(seconds)
                 yield self.section(measured, work, encoding, done / total)
 
-    def pair(self) -> Pairs:
-        """A pair of random images."""
-        index = torch.arange(2, device=self.device)
-        images = torch.rand(2, 3, 256, 256, device=self.device) * 2 - 1
-        return Pairs(images, index[:1], index[1:], ids=index[:1])
-
     def work(self) -> dict[str, Arithmetic]:
         """What a start's step takes of either contender, counted on the meta device: nothing is computed."""
         meta = replace(self, device=torch.device("meta"), compile=False)
         batch_prior, loop_prior = meta.priors()
-        pair = meta.pair()
+        pair = random_pair(meta.device)
         batched = Batched(PairEnergy(batch_prior, pair, seed=0), Ring(1).make(pair.ids, seed=0))
         loop = PlainLoop(loop_prior, pair.images, torch.zeros(3))
         pose = torch.zeros(3, device=meta.device, requires_grad=True)

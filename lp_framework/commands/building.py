@@ -123,12 +123,13 @@ def run_folder() -> Path:
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
-def warn_of_photographs() -> None:
-    """Say that the prior that ships knows no photographs."""
-    log.warning(
-        "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing. "
-        "For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER"
-    )
+def warn_of_photographs(prior: DictConfig) -> None:
+    """Of the config of the prior that ships, say that it knows no photographs."""
+    if prior.name == "tiny" and prior.path is None:
+        log.warning(
+            "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing. "
+            "For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER"
+        )
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

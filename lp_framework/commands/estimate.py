@@ -34,11 +34,8 @@ from lp_framework.data.camera_files import colmap_model, nerf_transforms
 from lp_framework.data.photographs import (
     FIELD_OF_VIEW_DEGREES,
     SIZE,
-    BackgroundRemover,
-    mask_files,
     photograph_files,
-    prepare,
-    read_image,
+    prepared_photographs,
     save_png,
 )
 from lp_framework.errors import UserError
@@ -91,7 +88,7 @@ def run(config: DictConfig) -> None:
         if not isinstance(config[key], bool):
             raise UserError(f"{key} must be true or false, got {config[key]}")
     files = photograph_files(config.images)
-    prepared = _prepared(files, config.masks, config.remove_background, config.crop)
+    prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
 
     solver, checkpoint = build_solver(config)
     move(solver, device)
@@ -124,14 +121,13 @@ def run(config: DictConfig) -> None:
     }
     _write(folder, estimated, prepared, result)
     _print(folder, estimated)
-    if knows_little(config):
-        warn_of_photographs()
+    warn_of_prior(config)
 
 
-def knows_little(config: DictConfig) -> bool:
-    """Whether the answer rests on the prior that ships."""
-    asked = registry.component_names(registry.get("solver", config.solver.name))
-    return "prior" in asked and config.prior.name == "tiny" and config.prior.path is None
+def warn_of_prior(config: DictConfig) -> None:
+    """Warn of a prior that knows no photographs where the solver's answer rests on it."""
+    if "prior" in registry.component_names(registry.get("solver", config.solver.name)):
+        warn_of_photographs(config.prior)
 
 
 def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
@@ -140,17 +136,6 @@ def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
     if not isinstance(radius, int | float) or not 0 < radius < math.inf:
         raise UserError(f"radius must be a positive number, got {radius}")
     return torch.tensor([math.radians(latitude_degrees), 0.0, radius], dtype=torch.float64)
-
-
-def _prepared(files: Sequence[Path], masks: str | None, remove_background: bool, crop: bool) -> list[Image.Image]:
-    """Every photograph, read and prepared; what is wrong with any of them shows before anything takes long."""
-    found = [None] * len(files) if masks is None else mask_files(files, masks)
-    images = [read_image(file) for file in files]
-    opened = [None if mask is None else read_image(mask) for mask in found]
-    remover = BackgroundRemover() if remove_background else None
-    return [
-        prepare(image, str(file), mask, remover, crop) for file, image, mask in zip(files, images, opened, strict=True)
-    ]
 
 
 def _texts(pose: Tensor) -> list[str]:

@@ -28,7 +28,7 @@ from lp_framework.evaluation.azimuth import NEAR_DEGREES, Profile, azimuth_energ
 from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.base import pairs_of
 from lp_framework.viz.azimuth import AzimuthPanel, azimuth_figure
 from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.style import save_figure
@@ -82,9 +82,7 @@ def overview(config: DictConfig, folder: Path) -> None:
     azimuths = torch.arange(config.azimuths) * (2 * math.pi / config.azimuths)
     energies, truth, objects = [], [], []
     for batch in tracked(list(data.test_dataloader()), "energies around the objects"):
-        assert batch.images is not None  # nothing caches features here
-        ids = table.pair_ids(batch.pairs)
-        pairs = Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
+        pairs = pairs_of(batch, table, device)
         poses = batch.relative_poses()
         energies.append(
             azimuth_energies(
@@ -94,7 +92,7 @@ def overview(config: DictConfig, folder: Path) -> None:
         truth.append(poses[:, 1])
         objects.append(batch.objects[batch.reference])
     rows = summarise(table, torch.cat(energies), azimuths, torch.cat(truth), torch.cat(objects))
-    for row, score in zip(rows, ambiguities(config, data, prior, grid), strict=True):
+    for row, score in zip(rows, ambiguities(config, data, prior, grid, device), strict=True):
         row["ambiguity_score"] = score.record()
     record = {"objects": rows, **overall(rows), "config": plain(config), "versions": versions()}
     write_json(folder / "azimuth.json", record)
@@ -111,18 +109,17 @@ def overview(config: DictConfig, folder: Path) -> None:
     console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
 
 
-def ambiguities(config: DictConfig, data: PairDataModule, prior: Prior, grid: tuple[Tensor, Tensor]) -> list[Ambiguity]:
+def ambiguities(
+    config: DictConfig, data: PairDataModule, prior: Prior, grid: tuple[Tensor, Tensor], device: torch.device
+) -> list[Ambiguity]:
     """The ambiguity of every object, by the landscapes of up to `PAIRS` pairs of the protocol `per_view`."""
-    device = choose_device(config.accelerator)
     split = data.evaluation_split()
     table, batches = data.table(split), data.data(split)
     pairs = table.pairs("per_view", config.seed)  # a row a view
     found = []
     for index in tracked(range(len(table.names)), "ambiguity of the objects"):
         batch = batches[pairs[table.views_of(index)[:PAIRS]]]
-        assert batch.images is not None  # nothing caches features here
-        ids = table.pair_ids(batch.pairs)
-        own = Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
+        own = pairs_of(batch, table, device)
         truth = batch.relative_poses()
         energies = prior_landscapes(
             prior, own, truth[:, 2], *grid, config.timesteps, config.noises, config.seed, config.batch

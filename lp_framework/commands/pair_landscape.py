@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -20,11 +20,12 @@ from lp_framework import registry
 from lp_framework.api import image_batch, move
 from lp_framework.commands.building import build_data, build_solver, plain, versions, warn_of_photographs
 from lp_framework.commands.device import choose_device
-from lp_framework.data.photographs import BackgroundRemover, mask_files, photograph_files, prepare, read_image
+from lp_framework.data.photographs import photograph_files, prepared_photographs
 from lp_framework.errors import UserError
-from lp_framework.evaluation.examples import EXAMPLES, Example, View, save_examples
+from lp_framework.evaluation.examples import EXAMPLES, Example, View, recording, save_examples
 from lp_framework.evaluation.landscape import Landscape, landscape_grid, model_landscape, prior_landscapes
 from lp_framework.evaluation.tables import write_arrays, write_json
+from lp_framework.figures.generated import generated_views
 from lp_framework.figures.shown_pairs import shown_pairs, words
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, wrap_angle
 from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint, load_model
@@ -38,6 +39,8 @@ from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.landscape import pair_figure, surface_figure
 from lp_framework.viz.pictures import ExactModel, as_pixels, way, with_field
 from lp_framework.viz.style import save_figure
+
+STEPS, GUIDANCE = 50, 3.0  # of DDIM, for what the prior generates at the ends
 
 
 class Shown(NamedTuple):
@@ -88,8 +91,6 @@ def run(config: DictConfig, folder: Path) -> None:
     )
     device = choose_device(config.accelerator)
     shown = photographs(config, device) if config.images is not None else data_pair(config, device)
-    if "trajectory" in config.solver:
-        config = OmegaConf.merge(config, {"solver": {"trajectory": True}})  # type: ignore[assignment]
     solver, checkpoint = build_solver(config)
     move(solver, device)
     prior, model = getattr(solver, "prior", None), getattr(solver, "model", None)
@@ -104,7 +105,7 @@ def run(config: DictConfig, folder: Path) -> None:
         energies = prior_landscapes(
             prior, shown.pairs, radius, latitude, longitude, config.timesteps, config.noises, config.seed, config.batch
         )
-        solution = solver.solve(shown.pairs, starts, config.seed)
+        solution = recording(solver).solve(shown.pairs, starts, config.seed)
     landscape = Landscape(latitude, longitude, radius.item(), energies[0].cpu())
     descent = descended(shown, solution, starts)
 
@@ -149,14 +150,8 @@ def photographs(config: DictConfig, device: torch.device) -> Shown:
     files = photograph_files(config.images)
     if len(files) != 2:
         raise UserError(f"images: a landscape is of two files, got {len(files)}")
-    masks = [None, None] if config.masks is None else mask_files(files, config.masks)
-    remover = BackgroundRemover() if config.remove_background else None
-    prepared = [
-        prepare(read_image(file), str(file), None if mask is None else read_image(mask), remover, config.crop)
-        for file, mask in zip(files, masks, strict=True)
-    ]
-    if config.prior.name == "tiny" and config.prior.path is None:
-        warn_of_photographs()
+    prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
+    warn_of_photographs(config.prior)
     index = torch.arange(2, device=device)
     pairs = Pairs(image_batch(prepared).to(device), index[:1], index[1:], ids=index[:1])
     return Shown(f"{files[0].name} and {files[1].name}", [str(file) for file in files], pairs, None, None)
@@ -195,11 +190,9 @@ def landscape_arrays(landscape: Landscape, descent: Descent, truth: Tensor | Non
 
 def drawn(config: DictConfig, shown: Shown, landscape: Landscape, descent: Descent, prior: Prior) -> Figure:
     """The picture of the pair, with what the prior generates at the ends."""
-    device = shown.pairs.images.device
-    ends = descent.ends.float().to(device)
-    source = prior.encode(shown.pairs.images[shown.pairs.reference])[torch.zeros(len(ends), dtype=torch.int64)]
-    generator = torch.Generator().manual_seed(config.seed)  # on the CPU: a GPU gets the same draws
-    views = [as_pixels(view) for view in prior.generate(source, ends, generator=generator)] if len(ends) else []
+    source = prior.encode(shown.pairs.images[shown.pairs.reference])
+    ends = descent.ends
+    views = list(generated_views(prior, source, ends, STEPS, GUIDANCE, config.seed)) if len(ends) else []
     count = len(landscape.minima())
     radius = f"{landscape.radius:+.2f}".replace("-", "\u2212")
     note = (

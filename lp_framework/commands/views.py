@@ -19,7 +19,7 @@ from lp_framework.api import image_batch
 from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.cache import tracked
-from lp_framework.data.photographs import BackgroundRemover, mask_files, on_white, prepare, read_image, save_png
+from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
@@ -113,11 +113,8 @@ def grid(latitudes: Sequence[float], longitudes: Sequence[float]) -> Tensor:
 def photograph(config: DictConfig) -> Source:
     """The file that `image` names, prepared as a photograph is."""
     file = Path(config.image)
-    image = read_image(file)
-    mask = None if config.masks is None else mask_files([file], config.masks)[0]
-    remover = BackgroundRemover() if config.remove_background else None
-    opened = None if mask is None else read_image(mask)
-    return Source(file, file.name, prepare(image, str(file), opened, remover, config.crop))
+    (image,) = prepared_photographs([file], config.masks, config.remove_background, config.crop)
+    return Source(file, file.name, image)
 
 
 def data_view(config: DictConfig) -> Source:

@@ -15,7 +15,6 @@ same share: it is about 0 where the object looks as large from both, negative wh
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageOps
 
+from lp_framework.atomic import written
 from lp_framework.errors import UserError
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
@@ -242,6 +242,22 @@ def prepare(
     return whole.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
 
 
+def prepared_photographs(
+    files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
+) -> list[Image.Image]:
+    """Image files as `prepare` has them, with their masks from the folder `masks`, if one is given.
+
+    All are read before the first is prepared, so that what is wrong with any file shows before anything takes long.
+    """
+    found = [None] * len(files) if masks is None else mask_files(files, masks)
+    images = [read_image(file) for file in files]
+    opened = [None if mask is None else read_image(mask) for mask in found]
+    remover = BackgroundRemover() if remove_background else None
+    return [
+        prepare(image, str(file), mask, remover, crop) for file, image, mask in zip(files, images, opened, strict=True)
+    ]
+
+
 def on_white(image: Image.Image) -> NDArray[np.uint8]:
     """Pixels `[H, W, 3]` of an RGBA image composed over white."""
     white = Image.new("RGBA", image.size, "white")
@@ -251,6 +267,5 @@ def on_white(image: Image.Image) -> NDArray[np.uint8]:
 
 def save_png(path: Path, image: Image.Image) -> None:
     """Write an image whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    image.save(partial, "PNG")
-    os.replace(partial, path)
+    with written(path) as partial:
+        image.save(partial, "PNG")

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from lp_framework.evaluation.azimuth import Profile, profile
-from lp_framework.evaluation.landscape import Landscape
+from lp_framework.evaluation.landscape import FLAT, Landscape
 
-FLAT = 0.9  # a floor of which no more than a tenth of the range is relief tells nothing
 EQUAL = 0.05  # of the floor's range; valleys whose depths differ by less are equally good answers
 HALF_TURN = 30.0  # degrees; so far from 180 a second valley may lie to be one of the other side
 

@@ -21,7 +21,7 @@ from lp_framework.geometry import (
     rotation_error,
     translation_error,
 )
-from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.base import Solution, Solver, pairs_of
 from lp_framework.solvers.starts import Starts
 
 
@@ -82,10 +82,8 @@ class Evaluation(LightningModule):
 
     def solve(self, batch: PairBatch) -> Solution:
         """The solver's solution of a batch's pairs."""
-        assert batch.images is not None  # evaluation never caches features
-        ids = self.table.pair_ids(batch.pairs).to(self.device)
-        pairs = Pairs(batch.images, batch.reference, batch.query, ids)
-        return self.solver.solve(pairs, self.starts.make(ids, self.seed), self.seed)
+        pairs = pairs_of(batch, self.table, self.device)
+        return self.solver.solve(pairs, self.starts.make(pairs.ids, self.seed), self.seed)
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:
         solution = self.solve(batch)

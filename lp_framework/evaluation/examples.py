@@ -31,7 +31,7 @@ from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import write_text
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs, Solver
+from lp_framework.solvers.base import Pairs, Solver, pairs_of
 
 EXAMPLES, FILE = "examples", "examples.json"  # the folder among the pictures, and the file in it
 MOST = 6
@@ -105,11 +105,9 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[Example]:
     picks = pick_examples(rotation[np.arange(len(rotation)), chosen], objects, table.names, table.unique_answer)
     views = np.array([divmod(int(rows["pair"][pick.row]), len(table)) for pick in picks])
     batch = data[views]
-    assert batch.images is not None and data.images is not None  # evaluation never caches features
-    device = evaluation.device
-    ids = table.pair_ids(batch.pairs).to(device)
-    pairs = Pairs(batch.images.to(device), batch.reference.to(device), batch.query.to(device), ids)
-    starts = evaluation.starts.make(ids, evaluation.seed)
+    assert data.images is not None  # evaluation never caches features
+    pairs = pairs_of(batch, table, evaluation.device)
+    starts = evaluation.starts.make(pairs.ids, evaluation.seed)
     solution = recording(evaluation.solver).solve(pairs, starts, evaluation.seed)
     truth = batch.relative_poses()
     landscapes = _landscapes(evaluation, pairs, truth[:, 2])

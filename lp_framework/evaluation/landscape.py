@@ -20,6 +20,7 @@ from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
 
+FLAT = 0.9  # a valley floor of which no more than a tenth of the range is relief tells nothing of the longitude
 PROMINENCE = 0.05  # of the landscape's range; a shallower dent is no minimum
 BATCH = 64  # poses
 

@@ -137,7 +137,7 @@ def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
     try:
         config: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
         return {"checkpoint": json.dumps({**settings(config), "file": path.name}, sort_keys=True)}
-    except (OSError, YAMLError, OmegaConfBaseException, AttributeError):
+    except (OSError, YAMLError, OmegaConfBaseException, AttributeError, RecursionError):
         return {"checkpoint": checkpoint}
 
 

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
+from lp_framework.atomic import written
 from lp_framework.data.pairs import ViewTable
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, PoseMetrics
 
@@ -25,31 +25,28 @@ ERRORS = ["rotation_error", "translation_error"]
 
 def write_text(path: Path, text: str) -> None:
     """Write a file whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, path)
+    with written(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON whole or not at all; what is not finite becomes null."""
-
-    def finite(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {str(key): finite(each) for key, each in value.items()}
-        if isinstance(value, list | tuple):
-            return [finite(each) for each in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
     write_text(path, json.dumps(finite(content), indent=2) + "\n")
+
+
+def finite(value: Any) -> Any:
+    """A value that JSON can hold: mappings, lists and plain values, with None for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
     """Write arrays by name, `.npz`, whole or not at all."""
-    content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type]  # of the stub
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content.getvalue())
-    os.replace(partial, path)
+    with written(path) as partial, partial.open("wb") as file:  # given a name, NumPy would add a suffix to it
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # of the stub
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from matplotlib.figure import Figure
 
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
-from lp_framework.evaluation.ambiguity import FLAT
-from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
+from lp_framework.evaluation.landscape import FLAT, Landscape, landscape_grid, prior_landscapes
 from lp_framework.figures.base import PaperFigure
 from lp_framework.figures.settings import check_noises, noises_in_words
 from lp_framework.figures.shown_pairs import shown_pairs, words
@@ -59,7 +57,7 @@ class LandscapesFigure(PaperFigure[list[SurfacePanel]]):
             landscape = Landscape(*grid, radius[number].item(), energies[number].cpu())
             count = len(landscape.minima())
             word = f"{count} minim{'um' if count == 1 else 'a'}"
-            if np.ptp(landscape.floor().numpy()) <= 1 - FLAT:
+            if landscape.flatness() >= FLAT:
                 word = "plateau"
             reference, query = shown.images[number]
             panels.append(SurfacePanel(words(name), word, reference, query, landscape, shown.truth[number].numpy()))

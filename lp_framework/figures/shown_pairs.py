@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError, nearest
-from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.base import Pairs, pairs_of
 
 
 class ShownPairs(NamedTuple):
@@ -49,13 +49,10 @@ def shown_pairs(
     arrays = data.data("test")
     assert arrays.images is not None  # nothing caches features here
     batch = arrays[numbers]
-    assert batch.images is not None
-    ids = table.pair_ids(batch.pairs)
-    pairs = Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
     return ShownPairs(
         list(objects),
         [table.ambiguities[table.names.index(name)] for name in objects],
-        pairs,
+        pairs_of(batch, table, device),
         batch.relative_poses(),
         table.poses[torch.from_numpy(numbers)],
         np.stack([np.asarray(arrays.images[pair]) for pair in numbers]),

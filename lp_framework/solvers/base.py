@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from lp_framework.data.pairs import PairBatch, ViewTable
 from lp_framework.errors import UserError
 from lp_framework.keyed_random import keyed_bits
 
@@ -33,6 +34,13 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.reference)
+
+
+def pairs_of(batch: PairBatch, table: ViewTable, device: torch.device) -> Pairs:
+    """The pairs of a batch of the views in `table`, on a device. The batch has images: nothing caches features."""
+    assert batch.images is not None
+    ids = table.pair_ids(batch.pairs)
+    return Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_start
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
+from lp_framework.solvers.stages import in_a_row
 from lp_framework.solvers.twist import TanhRadius
 
 LONGEST_STEP = 0.5  # radians and scene units; the prior is not to be left where it hardly depends on the pose
@@ -77,20 +78,7 @@ class GaussNewton(Solver):
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. Energies are those descended; a start is invalid when the model or the prior failed."""
         first = self.first.solve(pairs, starts, seed)
-        # A start that failed goes along at the origin, so that the others stay in their places.
-        second = self.refine(pairs, first.poses.masked_fill(~first.valid[..., None], 0.0), seed)
-        energies = second.energies.masked_fill(~first.valid, torch.nan)
-        trajectory = None
-        if first.trajectory is not None and second.trajectory is not None:
-            trajectory = torch.cat([first.trajectory, second.trajectory[:, :, 1:]], dim=2)
-        return Solution(
-            poses=torch.where(first.valid[..., None], second.poses, first.poses),
-            energies=energies,
-            valid=first.valid & second.valid,
-            chosen=choose(energies),
-            cost=Cost(first.cost.network_passes + second.cost.network_passes, first.cost.seconds + second.cost.seconds),
-            trajectory=trajectory,
-        )
+        return in_a_row(first, lambda ends: self.refine(pairs, ends, seed))
 
     @torch.inference_mode(False)
     @torch.no_grad()

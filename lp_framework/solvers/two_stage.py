@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose
+from lp_framework.solvers.base import Pairs, Solution, Solver
 from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.stages import in_a_row
 from lp_framework.solvers.twist import ChooseBy, TanhRadius, TwistDescent
 
 
@@ -70,28 +69,4 @@ class TwoStage(Solver):
         first = self.first.solve(pairs, starts, seed)
         if self.second.steps == 0:
             return first
-        # A start that failed goes along at the origin, so that the others stay in their places.
-        handed = first.poses.masked_fill(~first.valid[..., None], 0.0)
-        second = self.second.solve(pairs, handed, seed)
-        energies = second.energies.masked_fill(~first.valid, torch.nan)
-        return Solution(
-            poses=torch.where(first.valid[..., None], second.poses, first.poses),
-            energies=energies,
-            valid=first.valid & second.valid,
-            chosen=choose(energies),
-            cost=Cost(
-                network_passes=first.cost.network_passes + second.cost.network_passes,
-                seconds=first.cost.seconds + second.cost.seconds,
-            ),
-            trajectory=self._joined(first, second),
-        )
-
-    @staticmethod
-    def _joined(first: Solution, second: Solution) -> Tensor | None:
-        """Both stages' paths, the second's longitudes in the turn where the first ended; the hand-over counts once."""
-        if first.trajectory is None or second.trajectory is None:
-            return None
-        before, after = first.trajectory, second.trajectory[:, :, 1:]
-        turns = ((before[:, :, -1:, 1] - second.trajectory[:, :, :1, 1]) / (2 * math.pi)).round()
-        after = torch.stack([after[..., 0], after[..., 1] + 2 * math.pi * turns, after[..., 2]], dim=-1)
-        return torch.cat([before, after], dim=2)  # where the first stage failed the turns are NaN
+        return in_a_row(first, lambda ends: self.second.solve(pairs, ends, seed))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz.cameras import Viewpoint, best_viewpoint, draw_ground, draw_image, image_plane, ring, shrunk
-from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, show_image, styled
+from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, place_axes, show_image, styled, write
 
 RED, SKY = "#D7191C", "#56B4E9"
 TARGETS = (BLUE, ORANGE, GREEN, PURPLE, SKY, MUTED)  # a colour a target view
@@ -56,16 +56,16 @@ def camera_methods_figure(scenes: Sequence[CameraScene], methods: Sequence[str],
     top = height
     for row, (scene, view, (low, high), tall) in enumerate(zip(scenes, views, boxes, heights, strict=True)):
         top -= TOP
-        _write(figure, SIDE, top, height, f"(a) {scene.title}" if row == 0 else scene.title)
-        _draw_images(figure, scene, height, top, tall)
+        write(figure, SIDE, top, f"(a) {scene.title}" if row == 0 else scene.title)
+        _draw_images(figure, scene, top, tall)
         for number, (poses, word) in enumerate(zip(scene.predicted, scene.words, strict=True)):
             x = SIDE + IMAGES + GAP + number * (wide + GAP)
-            axes = figure.add_axes((x / WIDTH, (top - tall) / height, wide / WIDTH, tall / height))
+            axes = place_axes(figure, x, top - tall, wide, tall)
             _draw_scene(axes, scene, poses, view, field_of_view)
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
             axes.axis("off")
             if row == 0:
-                _write(figure, x, top, height, f"({chr(ord('b') + number)}) {methods[number]}")
+                write(figure, x, top, f"({chr(ord('b') + number)}) {methods[number]}")
             figure.text((x + wide) / WIDTH, (top + 0.05) / height, word, color=MUTED, fontsize=7.5, ha="right")
         top -= tall + GAP
     figure.legend(
@@ -80,14 +80,14 @@ def _images_height(scene: CameraScene) -> float:
     return rows * SIDE_OF_IMAGE + (rows - 1) * BETWEEN
 
 
-def _draw_images(figure: Figure, scene: CameraScene, height: float, top: float, room: float) -> None:
+def _draw_images(figure: Figure, scene: CameraScene, top: float, room: float) -> None:
     """The reference and the others, in the middle of a room of so many inches."""
     below = top - (room - _images_height(scene)) / 2
     for index, image in enumerate(scene.images):
         row, column = divmod(index, COLUMNS)
         x = SIDE + column * (SIDE_OF_IMAGE + BETWEEN)
         y = below - (row + 1) * SIDE_OF_IMAGE - row * BETWEEN
-        axes = figure.add_axes((x / WIDTH, y / height, SIDE_OF_IMAGE / WIDTH, SIDE_OF_IMAGE / height))
+        axes = place_axes(figure, x, y, SIDE_OF_IMAGE, SIDE_OF_IMAGE)
         show_image(axes, image, "")
         axes.spines[:].set(color=colour_of(index), linewidth=1.4)
 
@@ -120,10 +120,6 @@ def _draw_frustum(
     )  # fmt: skip
     lines.set_gid(kind)
     axes.add_collection(lines)
-
-
-def _write(figure: Figure, x: float, top: float, height: float, title: str) -> None:
-    figure.text(x / WIDTH, (top + 0.05) / height, title, fontsize=8.5)
 
 
 def colour_of(index: int) -> str:

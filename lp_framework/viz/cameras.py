@@ -15,7 +15,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from lp_framework.geometry import camera_to_world
-from lp_framework.viz.style import BLUE, FAINT, MUTED, VERMILION, show_image, styled
+from lp_framework.viz.style import BLUE, FAINT, MUTED, VERMILION, place_axes, show_image, styled
 
 ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the second relative to the reference
 MOST_CARDS, COLUMNS = 12, 6
@@ -128,10 +128,10 @@ def cameras_figure(
         row, column = divmod(index, columns)
         left = (WIDTH - columns * (side + GAP) + GAP) / 2 + column * (side + GAP)
         lower = height - TOP - tall - side - row * (side + TEXT)
-        axes = figure.add_axes((left / WIDTH, lower / height, side / WIDTH, side / height))
+        axes = place_axes(figure, left, lower, side, side)
         show_image(axes, _on_white(images[index]), "")
         axes.spines[:].set(color=_colour(index), linewidth=1.0)
-        below = figure.add_axes((left / WIDTH, (lower - TEXT) / height, side / WIDTH, TEXT / height))
+        below = place_axes(figure, left, lower - TEXT, side, TEXT)
         below.set(xlim=(0, side), ylim=(TEXT, 0))  # one data unit is an inch
         below.axis("off")
         _write_number(below, np.array([0.08, 0.1]), numbers[index], 3.0, _colour(index))

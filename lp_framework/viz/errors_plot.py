@@ -15,7 +15,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter, StrMe
 from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLD
-from lp_framework.viz.style import CLASS_COLOURS, FAINT, INK, MUTED, open_frame, show_image, styled
+from lp_framework.viz.style import CLASS_COLOURS, FAINT, INK, MUTED, open_frame, place_axes, show_image, styled
 
 MOST_OBJECTS = 42  # on a contact sheet
 NEAREST = 0.01  # scene units; where the logarithmic axis of translation errors begins
@@ -119,9 +119,9 @@ def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
         row, column = divmod(index, columns)
         left, upper = 0.1 + column * card, height - top - row * (card - gap + text)
         side = card - gap
-        axes = figure.add_axes((left / 8.0, (upper - side) / height, side / 8.0, side / height))
+        axes = place_axes(figure, left, upper - side, side, side)
         show_image(axes, each.image, "")
-        below = figure.add_axes((left / 8.0, (upper - side - text) / height, side / 8.0, text / height))
+        below = place_axes(figure, left, upper - side - text, side, text)
         _write_card(below, each, side)
     left_out = len(ranked) - len(shown)
     title = "Objects, worst first" + (f" (the {len(shown)} worst of {len(ranked)})" if left_out else "")

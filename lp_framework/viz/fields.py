@@ -28,6 +28,7 @@ from lp_framework.viz.style import (
     OTHERS,
     TRUTH,
     degrees,
+    place_axes,
     show_image,
     styled,
 )
@@ -140,8 +141,7 @@ def field_figure(
     figure = Figure(figsize=(WIDTH, height))
 
     def place(x: float, row: int, width: float) -> Axes:
-        bottom = height - TOP - (row + 1) * high - row * BETWEEN
-        return figure.add_axes((x / WIDTH, bottom / height, width / WIDTH, high / height))
+        return place_axes(figure, x, height - TOP - (row + 1) * high - row * BETWEEN, width, high)
 
     for index, (image, name) in enumerate(((reference, "reference"), (query, "query"))):
         column, row = (0, index) if columns == 1 else (index, 0)
@@ -157,10 +157,7 @@ def field_figure(
         axes.set_ylabel("latitude")
     axes.set_xlabel("longitude of the query relative to the reference")
     if greatest > 0 and quiver is not None:
-        bottom = BOTTOM / height
-        bar_axes = figure.add_axes(
-            ((WIDTH - BAR + 0.12) / WIDTH, bottom, 0.1 / WIDTH, (height - TOP - BOTTOM) / height)
-        )
+        bar_axes = place_axes(figure, WIDTH - BAR + 0.12, BOTTOM, 0.1, height - TOP - BOTTOM)
         bar = figure.colorbar(quiver, cax=bar_axes)
         bar.set_label("score magnitude (1/rad)")
         bar_axes.spines[:].set_visible(False)

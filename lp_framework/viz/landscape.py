@@ -16,11 +16,10 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator, StrMethodFormatter
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from lp_framework.evaluation.ambiguity import FLAT
-from lp_framework.evaluation.landscape import Landscape
+from lp_framework.evaluation.landscape import FLAT, Landscape, LandscapeMinimum
 from lp_framework.viz import fields
 from lp_framework.viz.fields import CHOSEN_MARK, END_MARK, START_MARK, TRUTH_MARK, FieldMap
-from lp_framework.viz.style import ANSWER, FAINT, INK, MUTED, show_image, styled
+from lp_framework.viz.style import ANSWER, FAINT, INK, MUTED, place_axes, show_image, styled
 
 # From dark valleys to light heights, evenly in lightness, so that grey and any kind of colour vision see the same.
 RELIEF = "cividis"
@@ -45,7 +44,7 @@ def surface_figure(landscape: Landscape, truth: NDArray | None = None, title: st
 
 def draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None = None) -> None:
     """Draw what `surface_figure` shows into axes of projection `3d`."""
-    latitude, longitude, energy = _closed(landscape)
+    latitude, longitude, energy = closed(landscape)
     low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
     relief = (high - low) or 1.0
     floor = low - 0.45 * relief
@@ -93,7 +92,7 @@ def map_figure(
     wide, high = 4.6, 4.6 * _limit(landscape) / 180
     width, height = LABELS + wide + BAR, (CAPTION if title else SIDE) + high + BELOW
     figure = Figure(figsize=(width, height))
-    axes = figure.add_axes((LABELS / width, BELOW / height, wide / width, high / height))
+    axes = place_axes(figure, LABELS, BELOW, wide, high)
     relief = draw_map(axes, landscape, trajectories, truth, chosen, title)
     _finish(figure, axes, relief, _keys(landscape, trajectories, truth, chosen))
     return figure
@@ -165,11 +164,11 @@ def draw_map(
     title: str = "",
 ) -> ScalarMappable:
     """Draw what `map_figure` shows into `axes`; returns what a colour bar needs. One-pose trajectories are ends."""
-    latitude, longitude, energy = _closed(landscape)
+    latitude, longitude, energy = closed(landscape)
     relief = axes.pcolormesh(longitude, latitude, energy, cmap=RELIEF, shading="gouraud", zorder=0)
     if np.nanmax(energy) > np.nanmin(energy):
         axes.contour(longitude, latitude, energy, levels=LEVELS, colors="white", linewidths=0.4, alpha=0.55, zorder=0.5)
-    for minimum in landscape.minima() if landscape.flatness() < FLAT else []:  # of a plateau, any place would do
+    for minimum in _marked(landscape):
         axes.plot(
             math.degrees(minimum.longitude), math.degrees(minimum.latitude), linestyle="none", zorder=2,
             **MINIMUM_MARK,
@@ -215,9 +214,14 @@ def _keys(
         (chosen is not None, "answer", CHOSEN_MARK),
         (trajectories is not None and len(trajectories) > (chosen is not None), "end", END_MARK),
         (trajectories is not None and trajectories.shape[1] > 1, "start", START_MARK),
-        (bool(landscape.minima()), "local minimum", MINIMUM_MARK),
+        (bool(_marked(landscape)), "local minimum", MINIMUM_MARK),
     ]
     return [Line2D([], [], linestyle="none", label=label, **mark) for shown, label, mark in entries if shown]
+
+
+def _marked(landscape: Landscape) -> list[LandscapeMinimum]:
+    """The minima that are marked: none on a plateau, where any place along the longitude would do."""
+    return landscape.minima() if landscape.flatness() < FLAT else []
 
 
 def _limit(landscape: Landscape) -> float:
@@ -225,7 +229,7 @@ def _limit(landscape: Landscape) -> float:
     return math.degrees(landscape.latitude.abs().max().item())
 
 
-def _closed(landscape: Landscape) -> tuple[NDArray, NDArray, NDArray]:
+def closed(landscape: Landscape) -> tuple[NDArray, NDArray, NDArray]:
     """Latitudes `[A]` and longitudes `[O + 1]` in degrees, and energies `[A, O + 1]`: 360 degrees is 0 again."""
     energy = landscape.energy.double().cpu().numpy()
     latitude, longitude = (np.rad2deg(each.double().cpu().numpy()) for each in landscape[:2])

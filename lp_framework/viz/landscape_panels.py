@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lp_framework.evaluation.landscape import Landscape
 from lp_framework.viz.landscape import draw_map, draw_surface
-from lp_framework.viz.style import ANSWER, INK, MUTED, show_image, styled
+from lp_framework.viz.style import ANSWER, INK, MUTED, place_axes, show_image, styled, write
 
 WIDTH, SIDE, TITLE = 7.0, 0.06, 0.24  # inches: the figure's width and margin, room for a title
 COLUMNS = 3  # of surfaces
@@ -195,15 +195,3 @@ def small_marks(axes: Axes) -> None:
     """The marks of a large map made fit for a small one."""
     for line in axes.lines:
         line.set_markersize(0.75 * line.get_markersize())
-
-
-def place_axes(figure: Figure, x: float, y: float, wide: float, tall: float) -> Axes:
-    """Axes in a box of the figure (inches from the lower left)."""
-    width, height = figure.get_size_inches()
-    return figure.add_axes((x / width, y / height, wide / width, tall / height))
-
-
-def write(figure: Figure, x: float, y: float, text: str) -> None:
-    """A panel's title above a place in the figure (inches from the lower left)."""
-    width, height = figure.get_size_inches()
-    figure.text(x / width, (y + 0.05) / height, text, fontsize=8.5)

@@ -17,7 +17,7 @@ from lp_framework.evaluation.examples import EXAMPLES, gather_examples, pick_pai
 from lp_framework.evaluation.metrics import summarise
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.models.pose_model import FieldValue, PoseModel
-from lp_framework.solvers.base import Pairs, Solution
+from lp_framework.solvers.base import Pairs, Solution, pairs_of
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
 from lp_framework.viz.fields import ARROW_SPACING, DENSITY_SPACING, FieldMap, field_figure, field_on_grid
@@ -100,11 +100,8 @@ def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, ND
 
     A solver with a model has two maps, its field and the exact one; any other has one, without arrows.
     """
-    assert batch.images is not None  # evaluation never caches features
-    device = evaluation.device
-    ids = evaluation.table.pair_ids(batch.pairs).to(device)
-    pairs = Pairs(batch.images.to(device), batch.reference.to(device), batch.query.to(device), ids)
-    starts = evaluation.starts.make(ids, evaluation.seed)
+    pairs = pairs_of(batch, evaluation.table, evaluation.device)
+    starts = evaluation.starts.make(pairs.ids, evaluation.seed)
     truth = batch.relative_poses()[0]
     solver = recording(evaluation.solver)
     solution = solver.solve(pairs, starts, evaluation.seed)
@@ -121,7 +118,7 @@ def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, ND
         maps.append(with_field(oracle, f"Exact {field} (oracle)", exact, pairs, truth))
     else:
         maps = [way("Starts and answer", solution, starts)]
-    reference, query = (as_pixels(batch.images[side[0]]) for side in (batch.reference, batch.query))
+    reference, query = (as_pixels(pairs.images[side[0]]) for side in (pairs.reference, pairs.query))
     return reference, query, truth.numpy(), maps
 
 

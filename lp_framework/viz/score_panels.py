@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from lp_framework.evaluation.landscape import Landscape
 from lp_framework.viz.fields import TRUTH_MARK, Grid, draw_arrows, longest
-from lp_framework.viz.landscape import RELIEF
-from lp_framework.viz.landscape_panels import place_axes, place_surface, write
-from lp_framework.viz.style import FAINT, MUTED, show_image, styled
+from lp_framework.viz.landscape import RELIEF, closed
+from lp_framework.viz.landscape_panels import place_surface
+from lp_framework.viz.style import FAINT, MUTED, place_axes, show_image, styled, write
 
 STAR = {**TRUTH_MARK, "markersize": 9.0}
 
@@ -131,9 +131,8 @@ def draw_field(axes: Axes, panel: FieldPanel, truth: NDArray) -> None:
 
 def _draw_density(axes: Axes, density: Landscape) -> None:
     """exp(-E) from above, with contour lines."""
-    latitude, longitude = (np.rad2deg(each.double().numpy()) for each in density[:2])
-    values = density.energy.double().numpy()
-    around = np.append(longitude, 360.0), latitude, np.concatenate([values, values[:, :1]], axis=1)
+    latitude, longitude, values = closed(density)
+    around = longitude, latitude, values
     axes.pcolormesh(*around, cmap=RELIEF, vmin=0, vmax=1, shading="gouraud", zorder=0)
     axes.contour(*around, levels=np.linspace(0.1, 0.9, 9), colors="white", linewidths=0.4, alpha=0.55, zorder=0.5)
     axes.set(xlim=(0, 360), ylim=(latitude[0], latitude[-1]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, ParamSpec
@@ -14,6 +13,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator, StrMethodFormatter
 from numpy.typing import NDArray
+
+from lp_framework.atomic import written
 
 # Okabe and Ito's palette, which the common kinds of colour blindness keep apart.
 BLUE, ORANGE, PURPLE, GREEN, VERMILION = "#0072B2", "#E69F00", "#CC79A7", "#009E73", "#D55E00"
@@ -74,17 +75,24 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
     files = []
     for suffix in ("png", "pdf"):
         file = path.with_name(f"{path.name}.{suffix}")
-        partial = path.with_name(f".{file.name}.partial")
         # Without a date the same figure is the same file.
         metadata = {"CreationDate": None} if suffix == "pdf" else None
-        try:
-            with matplotlib.rc_context(SETTINGS):
-                figure.savefig(partial, format=suffix, dpi=200, metadata=metadata)
-            os.replace(partial, file)
-        finally:
-            partial.unlink(missing_ok=True)
+        with written(file) as partial, matplotlib.rc_context(SETTINGS):
+            figure.savefig(partial, format=suffix, dpi=200, metadata=metadata)
         files.append(file)
     return files
+
+
+def place_axes(figure: Figure, x: float, y: float, wide: float, tall: float) -> Axes:
+    """Axes in a box of the figure (inches from the lower left)."""
+    width, height = figure.get_size_inches()
+    return figure.add_axes((x / width, y / height, wide / width, tall / height))
+
+
+def write(figure: Figure, x: float, y: float, text: str) -> None:
+    """A panel's title above a place in the figure (inches from the lower left)."""
+    width, height = figure.get_size_inches()
+    figure.text(x / width, (y + 0.05) / height, text, fontsize=8.5)
 
 
 def degrees(axes: Axes, which: Literal["x", "y"], step: float) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from lp_framework.viz.style import FAINT, MUTED, TRUTH, show_image, styled
+from lp_framework.viz.style import FAINT, MUTED, TRUTH, place_axes, show_image, styled
 
 # Inches: the figure's width, margins, the room for the latitudes, and the sides of the source and of the largest view.
 WIDTH, SIDE, TOP, BOTTOM, LABELS, SOURCE, LARGEST = 10.0, 0.1, 0.74, 0.42, 0.62, 1.8, 1.6
@@ -38,11 +37,8 @@ def views_figure(
     width, height = left + wide + SIDE, TOP + tall + BOTTOM
     figure = Figure(figsize=(width, height))
 
-    def place(x: float, y: float, across: float, up: float) -> Axes:
-        return figure.add_axes((x / width, y / height, across / width, up / height))
-
-    show_image(place(SIDE, BOTTOM + tall - SOURCE, SOURCE, SOURCE), source, "source")
-    axes = place(left, BOTTOM + tall - high, wide, high)
+    show_image(place_axes(figure, SIDE, BOTTOM + tall - SOURCE, SOURCE, SOURCE), source, "source")
+    axes = place_axes(figure, left, BOTTOM + tall - high, wide, high)
     # Data coordinates are those of cells: the centre of row r and column c is (c, r).
     axes.imshow(
         contact_sheet(views), interpolation="antialiased", extent=(-0.5, columns - 0.5, rows - 0.5, -0.5), aspect="auto"

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock
 
+from lp_framework.atomic import written
 from lp_framework.errors import UserError
 
 LIST = "objects.json"
@@ -64,11 +65,9 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
             views.mkdir(parents=True, exist_ok=True)
             with FileLock(views / ".objects.lock"):
                 if not path.exists():
-                    partial = path.with_suffix(".partial")
-                    partial.write_text(
-                        json.dumps({"chosen": how, "seen": lists.seen, "unseen": lists.unseen}, indent=1)
-                    )
-                    partial.replace(path)
+                    content = {"chosen": how, "seen": lists.seen, "unseen": lists.unseen}
+                    with written(path) as partial:
+                        partial.write_text(json.dumps(content, indent=1))
         except OSError as error:
             raise UserError(f"{views}: cannot be written ({error.strerror}); choose another folder") from error
     try:

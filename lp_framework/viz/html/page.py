@@ -6,7 +6,6 @@ import base64
 import gzip
 import html
 import json
-import math
 from collections.abc import Sequence
 from functools import cache
 from importlib import resources
@@ -14,7 +13,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from lp_framework.evaluation.tables import write_text
+from lp_framework.evaluation.tables import finite, write_text
 from lp_framework.viz.html.elements import Html, joined, tag
 
 
@@ -35,7 +34,7 @@ class Data:
 
     def as_json(self) -> str:
         """JSON that may stand in a script element; what is not finite is null."""
-        text = json.dumps(_finite(self.values), separators=(",", ":"), allow_nan=False)
+        text = json.dumps(finite(self.values), separators=(",", ":"), allow_nan=False)
         return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
@@ -66,11 +65,3 @@ def _plotly() -> str:
     from plotly.offline import get_plotlyjs  # takes a moment, and only pages need it
 
     return base64.b64encode(gzip.compress(get_plotlyjs().encode(), 6, mtime=0)).decode()
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

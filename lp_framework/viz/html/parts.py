@@ -14,7 +14,8 @@ import yaml
 from lp_framework.errors import UserError
 from lp_framework.viz.html.elements import Cell, Html, facts, folded, section, sentence, tag
 
-BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError)  # what a damaged file leads to
+# What a damaged file leads to.
+BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def read_json(file: Path) -> dict[str, Any]:
         content = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"there is no {file.name}") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{file.name} is damaged ({error})") from error
     if not isinstance(content, dict):
         raise UserError(f"{file.name} is damaged (it holds no object)")

@@ -47,7 +47,7 @@ def _config(folder: Path) -> dict[str, Any] | None:
     try:
         content: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
         return dict(content)
-    except (OSError, ValueError, TypeError, YAMLError, OmegaConfBaseException):
+    except (OSError, ValueError, TypeError, YAMLError, OmegaConfBaseException, RecursionError):
         return None
 
 
