@@ -25,7 +25,7 @@ BALL = np.random.default_rng(0).normal(size=(80, 3)) / 8  # places on an object
 
 def project(pose: Tensor, places: np.ndarray, size: int) -> np.ndarray:
     """Pixels `[M, 2]`, counted from the centre of the first one, where a view pose `[3]` sees places `[M, 3]`."""
-    rotation, centre = (part.numpy() for part in camera_to_world(pose.double())[:3].split([3, 1], dim=1))
+    rotation, centre = (part.cpu().numpy() for part in camera_to_world(pose.double())[:3].split([3, 1], dim=1))
     seen = (places - centre[:, 0]) @ rotation
     focal = size / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
     return np.stack([seen[:, 0], -seen[:, 1]], axis=1) / -seen[:, 2:] * focal + (size - 1) / 2

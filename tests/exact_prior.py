@@ -24,6 +24,9 @@ class ExactPrior(Prior):
     d_lon, so that a solver's draws can be seen in its path.
     """
 
+    offsets: Tensor
+    depths: Tensor
+
     def __init__(
         self,
         offsets: Sequence[float] = (0.0,),
@@ -36,7 +39,8 @@ class ExactPrior(Prior):
         if len(depths) != len(offsets) or min(depths) < 0:
             raise UserError(f"one depth, not negative, is needed for each of {len(offsets)} offsets, got {depths}")
         self.num_timesteps, self.latent_shape, self.image_size = 1000, (3, 1, 1), 8
-        self.offsets, self.depths = (torch.tensor(each, dtype=torch.float64) for each in (offsets, depths))
+        for name, each in (("offsets", offsets), ("depths", depths)):
+            self.register_buffer(name, torch.tensor(each, dtype=torch.float64), persistent=False)
         self.stiffness, self.noisy = stiffness, noisy
 
     def encode(self, images: Tensor) -> ViewCode:

@@ -48,6 +48,18 @@ NARROW = {
     "measure": "[second_stage]", "second_stage.architecture": "narrow", "second_stage.starts": "[1,2]",
     "second_stage.rounds": "1",
 }  # fmt: skip
+FEW = {
+    "backbone.image_size": "32", "data.batch_pairs": "36", "data.block": "3", "data.validation_views": "0",
+    "loader.rounds": "1", "loader.steps": "1", "encoding.rounds": "1",
+    "first_stage.views": "2", "first_stage.starts": "1", "first_stage.rounds": "1",
+    "precision.architecture": "narrow", "precision.starts": "1", "precision.rounds": "1",
+    "adam_gauss_newton.pairs": "2", "adam_gauss_newton.starts": "1", "adam_gauss_newton.rounds": "1",
+    "adam_gauss_newton.newton_steps": "2", "adam_gauss_newton.adam_steps": "3",
+    "rendering.views": "2", "rendering.resolution": "8", "rendering.rounds": "1",
+    "checkpoint.rounds": "1",
+    "scaling.pairs": "[1,2]", "scaling.starts": "[1,2]", "scaling.views": "[1,2]", "scaling.steps": "1",
+    "scaling.rounds": "1", "scaling.fixed": "{pairs: 1, starts: 1, sets: 1}",
+}  # fmt: skip
 
 
 def narrow(**settings) -> SecondStage:
@@ -525,21 +537,9 @@ def test_both_measurements_in_one_table(tmp_path):
 
 def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
     commands = Commands(tmp_path, train_views=6)
-    few = {
-        "backbone.image_size": "32", "data.batch_pairs": "36", "data.block": "3", "data.validation_views": "0",
-        "loader.rounds": "1", "loader.steps": "1", "encoding.rounds": "1",
-        "first_stage.views": "2", "first_stage.starts": "1", "first_stage.rounds": "1",
-        "precision.architecture": "narrow", "precision.starts": "1", "precision.rounds": "1",
-        "adam_gauss_newton.pairs": "2", "adam_gauss_newton.starts": "1", "adam_gauss_newton.rounds": "1",
-        "adam_gauss_newton.newton_steps": "2", "adam_gauss_newton.adam_steps": "3",
-        "rendering.views": "2", "rendering.resolution": "8", "rendering.rounds": "1",
-        "checkpoint.rounds": "1",
-        "scaling.pairs": "[1,2]", "scaling.starts": "[1,2]", "scaling.views": "[1,2]", "scaling.steps": "1",
-        "scaling.rounds": "1", "scaling.fixed": "{pairs: 1, starts: 1, sets: 1}",
-    }  # fmt: skip
     everything = f"measure=[{','.join(MEASUREMENTS)}]"
     settings = overrides(**{"second_stage.starts": "[1]"})
-    ran = commands.here("all", "bench", *settings, everything, *(f"{key}={value}" for key, value in few.items()))
+    ran = commands.here("all", "bench", *settings, everything, *(f"{key}={value}" for key, value in FEW.items()))
     assert ran.status == 0, ran.err
     kept = ran.json("bench.json")
     assert list(kept) == [*MEASUREMENTS, "device", "threads", "config", "versions"]

@@ -21,14 +21,14 @@ FEW = {"steps": 60, "refinement_steps": 60}  # for time's sake, of the solvers t
 WITHOUT_NETWORK = ("features",)  # by default
 
 
-def build(name: str, noisy: float = 0.1) -> Solver:
+def build(name: str, noisy: float = 0.1, **settings: int) -> Solver:
     """The solver with what it declares or imports: a prior, a model, packages and matches that know the answer."""
     solver = registry.get("solver", name)
     parts = {"prior": ExactPrior([0.0, torch.pi], [0.0, 0.3], stiffness=0.05, noisy=noisy), "model": ExactModel()}
     wanted = {part: parts[part] for part in registry.component_names(solver)}
     few = {setting: count for setting, count in FEW.items() if setting in inspect.signature(solver).parameters}
     with packages():
-        return know(registry.build("solver", {"name": name, **few}, **wanted))
+        return know(registry.build("solver", {"name": name, **few, **settings}, **wanted))
 
 
 def same(first: Solution, second: Solution, within: float = 0.0) -> bool:

@@ -110,7 +110,9 @@ class Commands:
             }  # fmt: skip
             if "model=prior" not in overrides:
                 settings["model.hidden"] = "16"
-        if command in ("convert", "report") or any(override.startswith("resume=") for override in overrides):
+        if command in ("convert", "estimate", "report") or any(
+            override.startswith("resume=") for override in overrides
+        ):
             settings = {"hydra.run.dir": name}
         settings |= dict(override.split("=", 1) for override in overrides if not override.startswith("-"))
         options = [override for override in overrides if override.startswith("-")]

@@ -83,6 +83,7 @@ def run(config: DictConfig) -> None:
         return
     write_result(folder, result, evaluation.metrics, evaluation.table)
     journal.finish()
+    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU; the pictures solve some pairs again
     save = save_pictures if config.views is None else save_summaries
     pictures = save(folder / "pictures", evaluation, data.data(data.evaluation_split()))
     print_results(folder, config, result, pictures)

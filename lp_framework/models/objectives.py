@@ -82,11 +82,10 @@ class NoisedPose:
         self.low, self.high = list(low), list(high)
 
     def draw(self, true: Tensor, generator: torch.Generator) -> Tensor:
-        """Noised poses `[P, 3]` for true relative poses `[P, 3]`."""
+        """Noised poses `[P, 3]` for true relative poses `[P, 3]`, with a generator on the CPU."""
         if self.noise == "gaussian":
-            return true + self.sigma * torch.randn(true.shape, generator=generator, device=true.device)
-        unit = torch.rand(true.shape, generator=generator, device=true.device)
-        return self.place(unit)
+            return true + self.sigma * torch.randn(true.shape, generator=generator).to(true)
+        return self.place(torch.rand(true.shape, generator=generator)).to(true)
 
     def place(self, unit: Tensor) -> Tensor:
         """Uniform draws in [0, 1] `[..., 3]` stretched over the box."""

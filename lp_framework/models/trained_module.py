@@ -48,10 +48,11 @@ class TrainedModule(LightningModule):
         torch.manual_seed(self._step_key() + (1 << 62))
 
     def _generator(self) -> torch.Generator:
-        """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does."""
-        generator = torch.Generator(self.device)
-        generator.manual_seed(self._step_key())
-        return generator
+        """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does.
+
+        It is drawn on the CPU: a GPU gets the same.
+        """
+        return torch.Generator().manual_seed(self._step_key())
 
     def _step_key(self) -> int:
         return (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank

@@ -27,7 +27,7 @@ def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
     phase = torch.complex(readout[:, 0], readout[:, 1])
     turn = phase[batch.query] * phase[batch.reference].conj()
     difference = readout[batch.query, 2:] - readout[batch.reference, 2:]
-    error = difference - true[:, ::2] * true.new_tensor(SCALE)
+    error = difference - torch.stack([true[:, 0] * SCALE[0], true[:, 2] * SCALE[1]], dim=1)
     longitude = torch.view_as_real(turn - torch.polar(torch.ones_like(true[:, 1]), true[:, 1]))
     return longitude.square().sum(dim=-1).mean() + error.square().mean()
 

@@ -166,8 +166,9 @@ class MultiView(Solver):
     def _refined(self, view_sets: ViewSets, initial: Joint, seed: int) -> Joint:
         """The second stage from N sets of poses at once."""
         sets, count, others, _ = initial.poses.shape
-        first, second = torch.tensor(list(combinations(range(others + 1), 2))).T.tolist()
-        energy = PairEnergy(self.prior, view_sets.pairs(first, second), seed)  # both directions of an unordered pair
+        ends = list(zip(*combinations(range(others + 1), 2), strict=True))
+        energy = PairEnergy(self.prior, view_sets.pairs(*ends), seed)  # both directions of an unordered pair
+        first, second = torch.tensor(ends, device=initial.poses.device)
         twist = initial.poses.new_zeros(sets, count, others * 6)
         to_poses = TwistPoses(initial.poses, self.second.radius_map)
 

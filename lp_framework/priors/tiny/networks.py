@@ -44,7 +44,7 @@ def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
     angle = pose[..., 1:2] * torch.arange(1, orders + 1, device=pose.device, dtype=pose.dtype)
     cosine, sine = angle.cos()[..., None], angle.sin()[..., None]
     turned = torch.stack([real * cosine - imaginary * sine, real * sine + imaginary * cosine], dim=-3)
-    moved = place + pose[..., ::2] * pose.new_tensor(SCALE)
+    moved = place + torch.stack([pose[..., 0] * SCALE[0], pose[..., 2] * SCALE[1]], dim=-1)
     return torch.cat([constant.expand(*moved.shape[:-1], -1), turned.flatten(-3), moved], dim=-1)
 
 

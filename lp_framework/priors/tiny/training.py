@@ -98,13 +98,13 @@ class PriorModel(TrainedModule):
         pixels = self._pixels(batch)
         code, latents = self.networks.encoder(self._features(batch)), self.networks.latents(pixels)
         generator = self._generator()
-        timestep = torch.randint(len(self.alphas_cumprod), (len(batch),), generator=generator, device=self.device)
-        noise = torch.randn(len(batch), latents.shape[1], generator=generator, device=self.device)
+        timestep = torch.randint(len(self.alphas_cumprod), (len(batch),), generator=generator).to(self.device)
+        noise = torch.randn(len(batch), latents.shape[1], generator=generator).to(self.device)
         error, predicted = self._denoise(batch, code, latents, timestep, noise)
         view_loss = relative_pose_loss(readout(code, self.networks.orders), batch)
 
         # The decoder sees what it will have to decode: latents of views, and samples of what is predicted.
-        chosen = torch.randperm(len(batch), generator=generator, device=self.device)[:DECODED]
+        chosen = torch.randperm(len(batch), generator=generator)[:DECODED].to(self.device)
         seen = torch.arange(len(chosen), device=self.device)[:, None] % 2 == 0
         query = batch.query[chosen]
         sampled = (predicted.mean + predicted.log_spread.exp() * noise)[chosen].detach()

@@ -1,0 +1,256 @@
+"""Solvers and commands on a pretended accelerator give the numbers of the CPU. Run by `test_pretended_device.py`."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning import Trainer
+from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.strategies import SingleDeviceStrategy
+from PIL import Image
+from pretended_device import FAR, FarTensor, Waits, pretended
+from solver_problems import around, exact_pairs, exact_sets
+from test_bench import FEW
+from test_figures import SMALL
+from test_solver_contract import SOLVERS, build
+from tiny_runs import Commands
+
+from lp_framework import api, load_prior, registry
+from lp_framework.benchmarks.second_stage import NARROW, random_pair
+from lp_framework.data.pairs import PairData
+from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.priors.base import Prior
+from lp_framework.priors.zero123.networks import Networks
+from lp_framework.priors.zero123.prior import Zero123Prior
+from lp_framework.solvers.base import Solution
+from lp_framework.solvers.pair_energy import PairEnergy
+from lp_framework.viz.pictures import save_pictures
+
+ON_HOST = ("dust3r", "features", "vggt")  # matching and other people's packages compute in NumPy, or by themselves
+FORWARD_MODE = ("gauss_newton",)  # PyTorch's forward-mode derivatives do not pass through a device written in Python
+PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1", "data.image_size=64")
+
+
+@pytest.fixture(autouse=True)
+def device() -> Iterator[None]:
+    with pretended():
+        yield
+
+
+def moved(batch: Any, device: torch.device = FAR) -> Any:
+    """A dataclass of tensors, on a device."""
+    return type(batch)(*(value.to(device) for value in vars(batch).values()))
+
+
+# ---------------------------------------------------------------- the device itself
+
+
+def test_the_device_is_apart_from_the_cpu_as_a_gpu_is():
+    here, there = torch.ones(3), torch.ones(3, device=FAR)
+    assert there.device == FAR and type(2 * there + there.sum() * torch.tensor(2.0)) is FarTensor
+    with pytest.raises(RuntimeError, match="same device"):
+        here + there
+    for away in (there.numpy, lambda: np.asarray(there)):
+        with pytest.raises(TypeError, match="numpy"):
+            away()
+    Waits.count = 0
+    assert there.sum().item() == 3 and there.cpu().tolist() == [1, 1, 1]
+    torch.tensor([1.0], device=FAR)
+    here.to(FAR)
+    assert Waits.count == 4
+
+
+# ---------------------------------------------------------------- priors
+
+
+@pytest.mark.parametrize("name", ["tiny", "zero123"])
+def test_a_priors_energy_is_the_same_there_and_its_gradient_waits_for_nothing(name):
+    prior: Prior = Zero123Prior(Networks(NARROW)) if name == "zero123" else load_prior("tiny")
+    pair = random_pair(torch.device("cpu"))
+    energies = []
+    for device in (torch.device("cpu"), FAR):
+        energy = PairEnergy(prior.to(device), moved(pair, device), seed=0)
+        poses = torch.tensor([[[0.1, 0.2, 0.0], [-0.2, 3.0, 0.1]]]).to(device).requires_grad_()
+        Waits.count = 0
+        energies.append(energy(poses, 300, energy.noise(0)[:, 0]))
+        (slope,) = torch.autograd.grad(energies[-1].sum(), poses)
+        energies.append(slope)
+        assert Waits.count == 0
+    for here, there in zip(energies[:2], energies[2:], strict=True):
+        torch.testing.assert_close(there.cpu(), here, rtol=1e-3, atol=1e-6)
+
+
+# ---------------------------------------------------------------- solvers
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FORWARD_MODE])
+def test_a_solver_finds_there_what_it_finds_here(name):
+    pairs, true = exact_pairs(3)
+    starts = around(true, 0.3, -0.4, 1.0)
+    here = build(name).solve(pairs, starts, seed=0)
+    solver = build(name)
+    api.move(solver, FAR)
+    there: Solution = solver.solve(moved(pairs), starts.to(FAR), seed=0)
+    for quantity in ("poses", "energies", "valid", "chosen"):
+        assert isinstance(getattr(there, quantity), FarTensor), quantity
+    torch.testing.assert_close(there.poses.cpu(), here.poses, rtol=0, atol=1e-3)
+    assert torch.equal(there.chosen.cpu(), here.chosen)
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FORWARD_MODE])
+def test_sets_of_images_too(name):
+    sets, _ = exact_sets(2, 3)
+    starts = torch.rand(2, 2, 3, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 6.0, 0.0])
+    here = build(name).solve_views(sets, starts, seed=0)
+    solver = build(name)
+    api.move(solver, FAR)
+    there = solver.solve_views(moved(sets), starts.to(FAR), seed=0)
+    torch.testing.assert_close(there.poses.cpu(), here.poses, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FORWARD_MODE + ON_HOST])
+def test_no_step_of_a_solver_waits_for_the_device(name):
+    """Twice the steps, the same number of waits."""
+    (pairs, true), solver = exact_pairs(2), registry.get("solver", name)
+    starts = around(true, 0.3, -0.4).to(FAR)
+    counted = [
+        key for key in ("iterations", "steps", "refinement_steps") if key in inspect.signature(solver).parameters
+    ]
+    assert counted
+    waits = []
+    for steps in (4, 8):
+        few = build(name, **dict.fromkeys(counted, steps))
+        api.move(few, FAR)
+        Waits.count = 0
+        few.solve(moved(pairs), starts, seed=0)
+        waits.append(Waits.count)
+    assert waits[0] == waits[1]
+
+
+# ---------------------------------------------------------------- commands
+
+
+class FarAccelerator(CPUAccelerator):
+    """Lightning's, for one such device."""
+
+    def setup_device(self, device: torch.device) -> None:
+        assert device == FAR
+
+
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
+    """A score model and a prior that have trained a little, on the CPU."""
+    commands = Commands(tmp_path_factory.mktemp("far"))
+    energy = ("model=energy", "data.image_size=64")
+    for name, settings in (("prior", PRIOR), ("score", ("data.image_size=64",)), ("energy", energy)):
+        trained = commands.here(name, "train", "trainer.max_epochs=1", *settings)
+        assert trained.status == 0, trained.err
+    return commands
+
+
+@pytest.fixture
+def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Once called, commands choose the device, as they would choose a GPU."""
+
+    def choose() -> None:
+        for command in ("bench", "estimate", "figure", "landscape", "pair_landscape", "views"):
+            monkeypatch.setattr(f"lp_framework.commands.{command}.choose_device", lambda accelerator: FAR)
+        strategy = SingleDeviceStrategy(device=FAR, accelerator=FarAccelerator())
+        trainer = functools.partial(Trainer, strategy=strategy)
+
+        def on_device(**settings: Any) -> Trainer:
+            return trainer(**{key: value for key, value in settings.items() if key != "strategy"})
+
+        monkeypatch.setattr("lp_framework.commands.building.Trainer", on_device)
+
+    return choose
+
+
+EVALUATION = ("checkpoint=score", "prior.path=prior", "data.image_size=64", "start=ring", "start.count=3")
+SHORT = {
+    "two_stage": ("solver=two_stage", "solver.iterations=3", "solver.refinement_steps=3"),
+    "id_pose": ("solver=id_pose", "solver.exploration_steps=2", "solver.refinement_steps=2"),
+    "multiview": ("solver=multiview", "views=3", "solver.refinement_steps=3"),
+}
+
+
+@pytest.mark.parametrize("solver", SHORT)
+def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
+    here = commands.here(f"{solver}_here", "eval", *EVALUATION, *SHORT[solver])
+    assert here.status == 0, here.err
+    chosen()
+    drawn_on = []
+
+    def save(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
+        drawn_on.append(next(evaluation.parameters()).device)
+        return save_pictures(folder, evaluation, data)
+
+    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", save)
+    there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver])
+    assert there.status == 0, there.err
+    assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
+    assert drawn_on == ([] if solver == "multiview" else [FAR])
+
+
+@pytest.mark.parametrize(("name", "settings"), [("score", ("data.image_size=64",)), ("prior", PRIOR)])
+def test_training_learns_the_same_weights(commands, chosen, name, settings):
+    chosen()
+    there = commands.here(f"{name}_there", "train", "trainer.max_epochs=1", *settings)
+    assert there.status == 0, there.err
+    here = torch.load(commands.folder / name / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    for key, value in there.checkpoint()["state_dict"].items():
+        torch.testing.assert_close(value, here[key], rtol=1e-3, atol=1e-4, msg=lambda text, key=key: f"{key}: {text}")
+
+
+def test_landscapes(commands, chosen):
+    grid = ("longitude_step_degrees=30", "latitude_step_degrees=20", "noises=1")
+    settings = (*grid, "checkpoint=score", "prior.path=prior", "data.image_size=64")
+    found = []
+    for place in ("here", "there"):
+        pair = commands.here(f"pair_{place}", "landscape", "object=cup", "query=1", "solver.steps=3", *settings)
+        every = commands.here(f"every_{place}", "landscape", *settings)
+        assert (pair.err, every.err) == ("", "")
+        found.append(np.load(pair.folder / "landscape.npz"))
+        chosen()
+    for key, value in found[0].items():
+        np.testing.assert_allclose(found[1][key], value, rtol=1e-3, atol=1e-3)
+
+
+def test_estimate_and_views(commands, chosen):
+    files = sorted((commands.folder / "views" / "cup" / "test" / "rgb").glob("*.png"))[:2]
+    found = []
+    for place in ("here", "there"):
+        settings = ("prior.path=prior", "crop=false")
+        images = (f"images=[{files[0]},{files[1]}]", "checkpoint=score", "solver.refinement_steps=3")
+        estimated = commands.here(f"estimate_{place}", "estimate", *images, *settings)
+        views = commands.here(f"views_{place}", "views", f"image={files[0]}", "longitudes=2", "steps=3", *settings)
+        assert (estimated.status, views.status) == (0, 0), (estimated.err, views.err)
+        drawn = sorted((views.folder / "views").glob("*.png"))
+        found.append(np.stack([np.asarray(Image.open(file), float) for file in drawn]))
+        chosen()
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1)
+
+
+@pytest.mark.parametrize("name", [name for name in SMALL if name != "recall"])  # which solves nothing
+def test_figures(commands, chosen, name):
+    chosen()
+    drawn = commands.here(
+        f"figure_{name}", "figure", f"experiment=figure_{name}", "prior.path=prior", "data.image_size=64", *SMALL[name]
+    )
+    assert drawn.status == 0, drawn.err
+
+
+def test_bench(tmp_path, chosen):
+    chosen()
+    names = ["encoding", "first_stage", "second_stage", "precision", "checkpoint"]  # others look at memory's addresses
+    settings = {**FEW, "second_stage.architecture": "narrow", "second_stage.starts": "[1]", "second_stage.rounds": "1"}
+    small = (f"{key}={value}" for key, value in settings.items())
+    ran = Commands(tmp_path, train_views=6).here("bench", "bench", f"measure=[{','.join(names)}]", *small)
+    assert ran.status == 0, ran.err

@@ -1,0 +1,27 @@
+"""All that computes, on a device that is not the CPU: `on_a_pretended_device.py`, in a process of its own, since the
+device is PyTorch's for as long as the process lives."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from torch.utils import backend_registration
+
+CHECKS = Path(__file__).with_name("on_a_pretended_device.py")
+
+
+@pytest.mark.skipif(
+    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this PyTorch knows no devices that are written in Python",
+)
+def test_commands_and_solvers_run_on_another_device(tmp_path):
+    line = [sys.executable, "-m", "pytest", "--quiet", "-p", "no:cacheprovider", f"--basetemp={tmp_path}", str(CHECKS)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    ran = subprocess.run(line, cwd=CHECKS.parents[1], env=environment, capture_output=True, text=True, timeout=900)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert re.search(r"^\d\d passed", ran.stdout.splitlines()[-1]), ran.stdout
