@@ -19,6 +19,7 @@ from lightning import Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.strategies import ModelParallelStrategy, StrategyRegistry
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
@@ -30,6 +31,10 @@ from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint,
 from lp_framework.solvers.base import Solver
 
 log = logging.getLogger(__name__)
+
+DIVIDED = "model_parallel"  # the strategy that divides a prior among processes; Lightning has no name for it
+if DIVIDED not in StrategyRegistry.available_strategies():
+    StrategyRegistry.register(DIVIDED, ModelParallelStrategy, description="a prior divided among the processes")
 
 # Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
 OF_NO_USE = (

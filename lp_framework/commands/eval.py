@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -79,13 +80,18 @@ def run(config: DictConfig) -> None:
     }
     if before is not None and before["versions"] != result["versions"]:
         result["versions_before"] = before["versions"]  # of what was solved before it was stopped
+    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU; the pictures solve some pairs again
+    save = save_pictures if config.views is None else save_summaries
     if not trainer.is_global_zero:
+        if evaluation.device_mesh is not None:  # a prior that is divided needs every process
+            with TemporaryDirectory() as aside:
+                save(Path(aside), evaluation, data.data(data.evaluation_split()))
+            trainer.strategy.barrier()
         return
     write_result(folder, result, evaluation.metrics, evaluation.table)
     journal.finish()
-    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU; the pictures solve some pairs again
-    save = save_pictures if config.views is None else save_summaries
     pictures = save(folder / "pictures", evaluation, data.data(data.evaluation_split()))
+    trainer.strategy.barrier()
     print_results(folder, config, result, pictures)
 
 

@@ -26,6 +26,7 @@ from rich.console import Console
 
 from lp_framework import registry
 from lp_framework.commands.building import (
+    DIVIDED,
     build_data,
     build_trainer,
     orderly_console,
@@ -62,6 +63,8 @@ def run(config: DictConfig) -> None:
         raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
     if checkpoint is not None and is_finished(folder, config, checkpoint):
         raise UserError(f"resume={folder}: has done all of its epochs; trainer.max_epochs=N would prolong it")
+    if config.trainer.strategy == DIVIDED:
+        raise UserError(f"trainer.strategy={DIVIDED} divides the prior of an eval; models are trained whole, take ddp")
     seed_run(config.seed)
     data = build_data(config)
     backbone = registry.build("backbone", config.backbone)

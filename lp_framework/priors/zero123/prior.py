@@ -6,6 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributed.device_mesh import DeviceMesh
+from torch.distributed.fsdp import fully_shard
 from torch.nn import functional
 
 from lp_framework.errors import UserError
@@ -68,6 +70,15 @@ class Zero123Prior(Prior):
         self.register_buffer("alphas_cumprod", alphas, persistent=False)
         self.register_buffer("clip_mean", torch.tensor(CLIP_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("clip_std", torch.tensor(CLIP_STD).view(3, 1, 1), persistent=False)
+
+    def shard(self, mesh: DeviceMesh) -> None:
+        """See `Prior.shard`: PyTorch's FSDP, block by block; a block's weights are gathered while it computes."""
+        unet, encoder = self.unet, self.image_encoder.vision_model.encoder
+        for block in (*unet.down_blocks, unet.mid_block, *unet.up_blocks, *encoder.layers):
+            fully_shard(block, mesh=mesh)
+        for network in (unet, self.image_encoder, self.vae.encoder, self.vae.decoder):
+            fully_shard(network, mesh=mesh)
+        self.chunks.group = mesh.get_group(mesh.ndim - 1)
 
     # ------------------------------------------------------------ images
 
