@@ -184,3 +184,50 @@ def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(
 def test_a_strategy_that_needs_gpus_says_so_in_a_sentence(commands):
     ran = commands.here("fsdp", "eval", "checkpoint=score", "trainer.strategy=fsdp", "trainer.accelerator=cpu")
     assert ran.error.startswith("trainer: The strategy `fsdp` requires a GPU accelerator")
+
+
+# ---------------------------------------------------------------- several nodes, of which this machine plays two
+
+
+def torchrun(node: int) -> tuple[list[str], dict[str, str]]:
+    """What runs on a node under `torchrun`."""
+    options = [
+        "--nnodes=2",
+        "--nproc-per-node=1",
+        f"--node-rank={node}",
+        "--master-addr=127.0.0.1",
+        "--master-port=29713",
+    ]
+    return [sys.executable, "-m", "torch.distributed.run", *options, "-m", "lp_framework"], {}
+
+
+def slurm(node: int) -> tuple[list[str], dict[str, str]]:
+    """What `srun --nodes=2 --ntasks-per-node=1` runs on a node, and what Slurm tells it."""
+    told = {
+        "SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "eval", "SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1",
+        "SLURM_NNODES": "2", "SLURM_NODELIST": "127.0.0.1", "SLURM_PROCID": str(node), "SLURM_NODEID": str(node),
+        "SLURM_LOCALID": "0", "MASTER_PORT": "29714",
+    }  # fmt: skip
+    return [sys.executable, "-m", "lp_framework"], told
+
+
+@pytest.mark.parametrize("launch", [torchrun, slurm])
+def test_two_nodes_give_the_results_of_one(commands, launch):
+    one = commands.here(f"{launch.__name__}_one", "eval", *EVALUATION)
+    assert one.status == 0, one.err
+    name = f"{launch.__name__}_two"
+    spread = ("trainer.num_nodes=2", "trainer.devices=1", "trainer.strategy=ddp", "trainer.accelerator=cpu")
+    processes = []
+    for node in (0, 1):
+        line, told = launch(node)
+        line += commands.arguments(name, "eval", *EVALUATION, *spread)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **told}
+        pipe = subprocess.PIPE
+        processes.append(
+            subprocess.Popen(line, cwd=commands.folder, env=environment, stdout=pipe, stderr=pipe, text=True)
+        )
+    for process in processes:
+        out, err = process.communicate(timeout=300)
+        assert process.returncode == 0, out + err
+    assert "MEMBER: 1/2" in (commands.folder / name / "eval.log").read_text()
+    assert_the_same(Ran(0, "", "", commands.folder / name), one)

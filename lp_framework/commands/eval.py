@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from lightning import Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 from omegaconf import DictConfig
 from rich.console import Console
@@ -30,6 +31,7 @@ from lp_framework.commands.building import (
 )
 from lp_framework.commands.finished import is_finished, unfinished_evaluation
 from lp_framework.data.module import EVALUATION_PAIRS, PairDataModule
+from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.journal import Journal, goes_on, unfinished
@@ -80,19 +82,7 @@ def run(config: DictConfig) -> None:
     }
     if before is not None and before["versions"] != result["versions"]:
         result["versions_before"] = before["versions"]  # of what was solved before it was stopped
-    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU; the pictures solve some pairs again
-    save = save_pictures if config.views is None else save_summaries
-    if not trainer.is_global_zero:
-        if evaluation.device_mesh is not None:  # a prior that is divided needs every process
-            with TemporaryDirectory() as aside:
-                save(Path(aside), evaluation, data.data(data.evaluation_split()))
-            trainer.strategy.barrier()
-        return
-    write_result(folder, result, evaluation.metrics, evaluation.table)
-    journal.finish()
-    pictures = save(folder / "pictures", evaluation, data.data(data.evaluation_split()))
-    trainer.strategy.barrier()
-    print_results(folder, config, result, pictures)
+    write_all(folder, result, trainer, evaluation, data.data(data.evaluation_split()), journal)
 
 
 def build_evaluation(config: DictConfig, solver: Solver, data: PairDataModule, journal: Journal) -> Evaluation:
@@ -117,11 +107,32 @@ def pairs_at_once(config: DictConfig, solver: Solver) -> int:
     return config.batch_pairs
 
 
-def print_results(folder: Path, config: DictConfig, result: dict[str, Any], pictures: Sequence[Path]) -> None:
+def write_all(
+    folder: Path, result: dict[str, Any], trainer: Trainer, evaluation: Evaluation, views: PairData, journal: Journal
+) -> None:
+    """Results, pictures and page; the first process writes them, once the results are those of all."""
+    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU; the pictures solve some pairs again
+    save = save_summaries if isinstance(evaluation, ViewSetEvaluation) else save_pictures
+    divided = evaluation.device_mesh is not None  # a prior that needs every process, for the pictures too
+    if trainer.is_global_zero:
+        write_result(folder, result, evaluation.metrics, evaluation.table)
+        journal.finish()
+        pictures = save(folder / "pictures", evaluation, views)
+        print_results(folder, result, pictures)
+    elif divided:
+        with TemporaryDirectory() as aside:
+            save(Path(aside), evaluation, views)
+    if divided:
+        trainer.strategy.barrier()
+
+
+def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]) -> None:
     """The table, the cost, and where the rest is."""
+    config = result["config"]
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
-    choices = f"{config.data.name}, {config.solver.name}, start={config.start.name}"
-    counted = f"pairs ({config.protocol})" if config.views is None else f"poses in sets of {config.views} images"
+    choices = f"{config['data']['name']}, {config['solver']['name']}, start={config['start']['name']}"
+    sets = config["views"] is not None
+    counted = f"poses in sets of {config['views']} images" if sets else f"pairs ({config['protocol']})"
     title = f"{choices}, {result['pairs']} {counted}"
     console.print(terminal_table(title, summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")

@@ -133,7 +133,7 @@ def _load(origin: str, network: nn.Module, weights: Mapping[str, Callable[[], Te
         if tensor.shape != expected[name].shape:
             shapes = f"{list(tensor.shape)} instead of {list(expected[name].shape)}"
             raise UserError(f"{origin}: '{name}' has the shape {shapes}")
-        # What is stored in the wanted type stays mapped: processes share it. Of the rest the file's bytes are let go of.
+        # What is stored in the wanted type stays mapped, and processes share it; else the file's bytes are let go of.
         mapped_is_wanted = tensor.dtype == dtype and tensor.is_contiguous()
         tensors[name] = tensor if mapped_is_wanted else torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
     network.load_state_dict(tensors, assign=True)

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributed.device_mesh import DeviceMesh
-from torch.distributed.fsdp import fully_shard
 from torch.nn import functional
 
 from lp_framework.errors import UserError
@@ -73,6 +72,8 @@ class Zero123Prior(Prior):
 
     def shard(self, mesh: DeviceMesh) -> None:
         """See `Prior.shard`: PyTorch's FSDP, block by block; a block's weights are gathered while it computes."""
+        from torch.distributed.fsdp import fully_shard  # not in every build of PyTorch
+
         unet, encoder = self.unet, self.image_encoder.vision_model.encoder
         for block in (*unet.down_blocks, unet.mid_block, *unet.up_blocks, *encoder.layers):
             fully_shard(block, mesh=mesh)
