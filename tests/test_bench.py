@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -307,6 +308,34 @@ def test_peak_memory_is_that_of_tensors_alive_at_once():
     variable = torch.ones(1000, requires_grad=True)
     kept = peak_bytes(lambda: variable.exp().exp().exp().sum().backward(), CPU)
     assert 3 * 4000 <= kept <= 6 * 4000  # three results are kept for the backward pass
+
+
+class Allocator:
+    """A GPU's, of which this machine has none: what `torch.cuda` says of it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = self.most = 1000
+        answers = {
+            "synchronize": lambda device: None,
+            "reset_peak_memory_stats": lambda device: setattr(self, "most", self.now),
+            "memory_allocated": lambda device: self.now, "max_memory_allocated": lambda device: self.most,
+        }  # fmt: skip
+        for name, answer in answers.items():
+            monkeypatch.setattr(torch.cuda, name, answer)
+
+    def step(self) -> None:
+        """Work that takes 30 bytes for a while."""
+        self.most = max(self.most, self.now + 30)
+
+
+def test_a_gpus_memory_is_what_its_allocator_says(monkeypatch):
+    allocator, gpu = Allocator(monkeypatch), torch.device("cuda")
+    allocator.most = 5000  # of what was before
+    assert peak_bytes(allocator.step, gpu) == 30
+    allocator.most = 5000
+    prior = torch.nn.Linear(3, 2)
+    seconds, peak = dataclasses.replace(narrow(), device=gpu).run(allocator, prior)
+    assert peak == 30 + 4 * (6 + 2) and seconds >= 0
 
 
 # ---------------------------------------------------------------- encoding and the first stage
