@@ -81,7 +81,7 @@ def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Im
 
 def image_batch(prepared: Sequence[Image.Image]) -> Tensor:
     """Images `[I, 3, H, W]` in [-1, 1], on white, of prepared ones (RGBA, all of one size)."""
-    return as_images(np.stack([on_white(image) for image in prepared]))
+    return as_images(torch.from_numpy(np.stack([on_white(image) for image in prepared])))
 
 
 def move(solver: Solver, device: torch.device) -> None:

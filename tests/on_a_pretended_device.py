@@ -186,16 +186,23 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
     here = commands.here(f"{solver}_here", "eval", *EVALUATION, *SHORT[solver])
     assert here.status == 0, here.err
     chosen()
-    drawn_on = []
+    gathered_on, drawn_on = [], []
+    result = Evaluation.result
+
+    def gathered(evaluation: Evaluation) -> dict[str, Any]:
+        gathered_on.extend({each.device for each in (*evaluation.metrics.pair, *evaluation.costs.cost)})
+        return result(evaluation)
 
     def save(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
         drawn_on.append(next(evaluation.parameters()).device)
         return save_pictures(folder, evaluation, data)
 
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", save)
+    monkeypatch.setattr(Evaluation, "result", gathered)
     there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver])
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
+    assert gathered_on == [FAR]  # NCCL gathers what is on GPUs
     assert drawn_on == ([] if solver == "multiview" else [FAR])
 
 

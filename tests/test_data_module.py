@@ -63,6 +63,9 @@ class Means:
         self.shown += len(images)
         return self.weight * images.mean(dim=(2, 3))
 
+    def to(self, device: torch.device) -> None:
+        """It has nothing to move."""
+
     def fingerprint(self) -> str:
         return f"means {self.weight}"
 
@@ -176,7 +179,7 @@ def test_a_view_shows_its_own_file(make, split):
         np.testing.assert_array_equal(data.images[view], expected)
     pairs = data.table.pairs("ordered")[-5:]
     batch = data[pairs]
-    assert torch.equal(batch.images[batch.query], as_images(data.images[pairs[:, 1]]))
+    assert torch.equal(batch.images[batch.query], as_images(torch.from_numpy(data.images[pairs[:, 1]])))
 
 
 def test_features_are_computed_once_and_are_the_backbones(make):
@@ -189,7 +192,7 @@ def test_features_are_computed_once_and_are_the_backbones(make):
     for split in ("train", "validation", "test"):
         pairs = data.table(split).pairs("ordered")
         batch, images = data.data(split)[pairs], plain.data(split)[pairs].images
-        assert batch.images is None
+        assert batch.pixels is None
         torch.testing.assert_close(batch.features, Means().trunk(images), rtol=0, atol=1e-6)
     again = make(seed=3)  # the views are divided otherwise, in a run of its own
     again.cache_features(extractor)
@@ -203,7 +206,7 @@ def test_features_belong_to_the_weights_and_the_images(make):
         data = make()
         data.cache_features(extractor)
         view = data.data("test")[np.array([[0, 1]])]
-        expected = extractor.weight * as_images(make().data("test").images[:2]).mean(dim=(2, 3))
+        expected = extractor.weight * as_images(torch.tensor(make().data("test").images[:2])).mean(dim=(2, 3))
         torch.testing.assert_close(view.features, expected, rtol=0, atol=1e-6)
     assert first.shown == other.shown == 3 * 4
     data = make(image_size=8)
@@ -257,7 +260,7 @@ def test_evaluation_goes_through_the_test_views(make, protocol):
     loader = data.test_dataloader()
     assert sorted(pairs_of(loader)) == numbers(data.table("test"), protocol)
     for batch in loader:
-        assert batch.images is not None and len(batch) <= EVALUATION_PAIRS
+        assert batch.pixels is not None and len(batch) <= EVALUATION_PAIRS
         reference, query = batch.poses[batch.reference], batch.poses[batch.query]
         assert torch.equal(batch.relative_poses(), relative_pose(reference, query).float())
 

@@ -14,12 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
+from test_solver_contract import build
 from tiny_runs import OBJECTS, Commands, Ran
 
+from lp_framework.commands.eval import pairs_at_once
+from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairBatch
 from lp_framework.evaluation.evaluation import errors
 from lp_framework.geometry import camera_to_world, relative_camera, rigid_transform, so3_exp
 from lp_framework.solvers.base import Cost, Solution
+from lp_framework.solvers.starts import Ring
 
 METRICS = {f"{kind}@{degrees}" for kind in ("R", "R(R)", "SR", "SR(R)") for degrees in (5, 15, 30)}
 METRICS |= {"rotation_error", "translation_error"}
@@ -194,10 +199,21 @@ def test_two_processes_give_every_number_of_one(evaluated, commands):
 # ---------------------------------------------------------------- errors of a solution
 
 
+@pytest.mark.parametrize(
+    ("solver", "starts", "pairs"), [("ifusion", 9, 4), ("two_stage", 2, 18), ("ifusion", 100, 1), ("id_pose", 9, 72)]
+)
+def test_a_batch_of_pairs_fills_a_large_prior_and_no_more(monkeypatch, solver, starts, pairs):
+    config = OmegaConf.create({"batch_pairs": None, "seed": 0})
+    built = build(solver)
+    assert pairs_at_once(config, built, Ring(starts)) == EVALUATION_PAIRS
+    monkeypatch.setattr("lp_framework.commands.eval.LARGE", -1)
+    assert pairs_at_once(config, built, Ring(starts)) == pairs
+
+
 def test_errors_compare_the_querys_predicted_camera_with_its_true_one():
     poses = torch.tensor([[0.1, 0.3, 1.5], [0.4, 2.0, 1.3]], dtype=torch.float64)
     batch = PairBatch(
-        images=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
+        pixels=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
         reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]), pairs=torch.tensor([1, 2]),
     )  # fmt: skip
     true = batch.relative_poses()[:, None].double()
@@ -216,7 +232,7 @@ def test_errors_compare_the_querys_predicted_camera_with_its_true_one():
 def test_full_cameras_are_judged_at_the_scale_that_suits_each_best():
     poses = torch.tensor([[0.1, 0.3, 1.5], [0.4, 2.0, 1.3]], dtype=torch.float64)
     batch = PairBatch(
-        images=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
+        pixels=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
         reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]), pairs=torch.tensor([1, 2]),
     )  # fmt: skip
     true = relative_camera(batch.cameras, batch.cameras.flip(0))[:, None]

@@ -19,7 +19,7 @@ from exact_prior import ExactPrior, image_of
 from page_runs import NASTY, STEPS, WRITERS, example, torch_equal, write_evaluation, write_training
 from PIL import Image
 
-from lp_framework.data.pairs import PairData, ViewTable
+from lp_framework.data.pairs import PairBatch, PairData, ViewTable
 from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
 from lp_framework.evaluation import examples as examples_module
@@ -161,13 +161,19 @@ class Tells(torch.nn.Module):
         return FieldValue(torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1), None)
 
 
+class Told(PairBatch):
+    """Images that say their poses; pixels would round them."""
+
+    @property
+    def images(self):
+        return image_of(self.poses.float())
+
+
 class Exact(PairData):
-    """Views whose images say their poses; stored pixels would round them."""
+    """Views whose images say their poses."""
 
     def __getitem__(self, pairs):
-        batch = super().__getitem__(pairs)
-        batch.images = image_of(batch.poses.float())
-        return batch
+        return Told(**vars(super().__getitem__(pairs)))
 
 
 @pytest.fixture

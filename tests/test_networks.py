@@ -47,7 +47,7 @@ def batch(views: int = 4, seed: int = 0) -> PairBatch:
     first, second = torch.meshgrid(torch.arange(views), torch.arange(views), indexing="ij")
     reference, query = first[first != second], second[first != second]
     return PairBatch(
-        images=torch.rand(views, 3, 8, 8, generator=generator) * 2 - 1, features=None, poses=poses,
+        pixels=torch.randint(256, (views, 8, 8, 3), generator=generator, dtype=torch.uint8), features=None, poses=poses,
         cameras=camera_to_world(poses), objects=torch.zeros(views, dtype=torch.long),
         reference=reference, query=query, pairs=reference * views + query,
     )  # fmt: skip
@@ -201,7 +201,7 @@ def test_cached_features_give_the_loss_of_the_images():
     model = ScoreModel(Colors())
     pairs = batch()
     by_image = model.training_step(pairs, 0)
-    pairs.features, pairs.images = model.backbone.trunk(pairs.images), None
+    pairs.features, pairs.pixels = model.backbone.trunk(pairs.images), None
     torch.testing.assert_close(model.training_step(pairs, 0), by_image)
 
 

@@ -284,7 +284,7 @@ def test_a_batch_has_each_view_once_and_points_to_it(data):
         assert len(batch) == len(pairs) and batch.images.shape == (len(views), 3, 4, 4)
         for side, column in ((batch.reference, 0), (batch.query, 1)):
             assert torch.equal(batch.cameras[side], data.table.cameras[torch.from_numpy(pairs[:, column])])
-            assert torch.equal(batch.images[side], as_images(data.images[pairs[:, column]]))
+            assert torch.equal(batch.images[side], as_images(torch.from_numpy(data.images[pairs[:, column]])))
             assert torch.equal(batch.poses[side], data.table.poses[torch.from_numpy(pairs[:, column])])
             assert torch.equal(batch.objects[side], data.table.object_of_view[torch.from_numpy(pairs[:, column])])
         assert torch.equal(batch.objects[batch.reference], batch.objects[batch.query])
@@ -310,7 +310,7 @@ def test_a_batch_of_one_pair_and_of_a_repeated_pair(data):
 def test_features_take_the_place_of_images(data):
     features = np.random.default_rng(1).normal(size=(len(data.table), 5)).astype(np.float32)
     batch = PairData(data.table, data.images, features)[np.array([[7, 12], [12, 8]])]
-    assert batch.images is None and batch.features.dtype == torch.float32
+    assert batch.pixels is None and batch.features.dtype == torch.float32
     np.testing.assert_array_equal(batch.features[batch.reference], features[[7, 12]])
     np.testing.assert_array_equal(batch.features[batch.query], features[[12, 8]])
 
@@ -329,14 +329,14 @@ def test_a_batch_does_not_write_into_the_cache(tmp_path, recwarn):
     np.save(tmp_path / "images.npy", pixels)
     mapped = np.load(tmp_path / "images.npy", mmap_mode="r")
     batch = PairData(table_of(2), mapped, None)[np.array([[0, 1]])]
+    batch.pixels.zero_()
     batch.images.zero_()
-    as_images(mapped[:]).zero_()
     np.testing.assert_array_equal(mapped, pixels)
     assert [str(warning.message) for warning in recwarn] == []
 
 
 def test_images_run_from_minus_one_to_one_exactly():
-    pixels = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 16, 16, 3)
+    pixels = torch.arange(256, dtype=torch.uint8).repeat_interleave(3).reshape(1, 16, 16, 3)
     images = as_images(pixels)
     assert images.dtype == torch.float32 and images.shape == (1, 3, 16, 16)
     assert images.min() == -1 and images.max() == 1
@@ -345,6 +345,6 @@ def test_images_run_from_minus_one_to_one_exactly():
 
 
 def test_channels_and_rows_keep_their_places():
-    pixels = np.zeros((2, 4, 6, 3), np.uint8)
+    pixels = torch.zeros(2, 4, 6, 3, dtype=torch.uint8)
     pixels[1, 3, 5, 2] = 255
     assert torch.argwhere(as_images(pixels) > 0).tolist() == [[1, 2, 3, 5]]

@@ -90,8 +90,8 @@ def test_generated_views_look_like_the_object_from_there(landscape, folder, name
     prior = lp_framework.load_prior("tiny")
     views = read_views(folder / "datasets" / "toy", name, "test")
     _, pixels = decoded_views(views.files, 64, folder / "cache")
-    images, poses = as_images(pixels), views.poses.float()
-    code = prior.encode(as_images(decoded_views(views.files, 256, folder / "cache")[1]))
+    images, poses = as_images(torch.tensor(pixels)), views.poses.float()
+    code = prior.encode(as_images(torch.tensor(decoded_views(views.files, 256, folder / "cache")[1])))
     source = code[torch.zeros(len(images), dtype=torch.long)]
     pose = relative_pose(poses[:1].expand_as(poses), poses)
     generated = prior.generate(source, pose, generator=torch.Generator().manual_seed(0))
@@ -102,7 +102,7 @@ def test_generated_views_look_like_the_object_from_there(landscape, folder, name
 
 def test_the_score_model_finds_the_pose(landscape, folder):
     views = read_views(folder / "datasets" / "toy", "duck", "test")
-    images = as_images(decoded_views(views.files, 256, folder / "cache")[1])
+    images = as_images(torch.tensor(decoded_views(views.files, 256, folder / "cache")[1]))
     model = lp_framework.load_model(SHIPPED / "score")
     solver = registry.build("solver", {"name": "langevin", "gamma": 0.0}, model=model)
     count = len(images)

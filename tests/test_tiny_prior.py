@@ -117,6 +117,12 @@ def test_training_lowers_the_loss_and_says_what_is_next(trained):
     assert f"views prior.path={trained.folder.name}" in trained.out
 
 
+def test_it_trains_in_mixed_precision(commands):
+    ran = commands.here("mixed", "train", *PRIOR, "trainer.precision=bf16-mixed", "trainer.max_epochs=1")
+    assert ran.status == 0, ran.err
+    assert 0 < ran.json("training.json")["final"]["val/loss"] < 10
+
+
 def test_a_backbone_may_be_trained_along(commands):
     ran = commands.here("along", "train", *PRIOR, "data.image_size=64", "backbone.frozen=false", "trainer.max_epochs=1")
     assert ran.status == 0, ran.err

@@ -157,6 +157,14 @@ def test_no_validation_views_train_on_all_and_keep_the_last(commands):
     assert "val/loss" not in ran.json("training.json")["final"]
 
 
+def test_mixed_precision_and_a_backbone_that_trains_along(commands):
+    mixed = ("trainer.precision=bf16-mixed", "backbone.frozen=false", "trainer.max_epochs=1")
+    ran = commands.here("half", "train", *mixed)
+    assert ran.status == 0, ran.err
+    assert ran.json("training.json")["final"]["val/loss"] > 0
+    assert {value.dtype for value in ran.checkpoint()["state_dict"].values()} == {torch.float32}
+
+
 @pytest.mark.parametrize("setting", ["model.noise=gaussian", "model.target=line", "model.schedule=constant"])
 def test_the_papers_alternatives_train(commands, setting):
     ran = commands.here(setting.replace("=", "_"), "train", setting, "model.view_loss=0", "trainer.max_epochs=1")

@@ -394,7 +394,7 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
     assert learned.ends is not None and learned.chosen is not None
     np.testing.assert_allclose(learned.ends[learned.chosen], answer, atol=1e-4)
     # The arrows are the model's score at the true radius.
-    assert batch.images is not None and learned.arrows is not None and exact.arrows is not None
+    assert batch.pixels is not None and learned.arrows is not None and exact.arrows is not None
     features = model.encode(batch.images)
     condition = model.condition(features[batch.reference], features[batch.query])
     pose = pose_grid(float(truth[2]), 12.0)

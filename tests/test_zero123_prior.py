@@ -202,8 +202,9 @@ def test_the_compiled_network_gives_the_same_numbers(prior, problem, checkpoint)
         close(actual, wanted, 1e-4)
 
 
-def test_bfloat16_keeps_energies_and_their_slopes(prior, problem, checkpoint):
-    other = small(Zero123(checkpoint, dtype="bfloat16"))
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_half_precision_keeps_energies_and_their_slopes(prior, problem, checkpoint, dtype):
+    other = small(Zero123(checkpoint, dtype=dtype))
     energies, slopes = energies_and_slopes(other, *problem)
     wanted, wanted_slopes = energies_and_slopes(prior, *problem)
     assert energies.dtype == slopes.dtype == torch.float32

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from lp_framework.benchmarks.section import synchronise
+from lp_framework.clock import now
 
 # Dense tensor-core rates by NVIDIA's data sheets, TFLOP/s: of bfloat16 and float16, and of TF32, in which PyTorch lets
 # cuDNN convolve float32 unless told otherwise. The first name that is found in the device's counts.
@@ -87,9 +86,7 @@ def matmul_rate(device: torch.device, dtype: torch.dtype) -> float:
     matrix @ matrix
     seconds = []
     for _ in range(REPEATS):
-        synchronise(device)
-        began = time.perf_counter()
+        began = now(device)
         matrix @ matrix
-        synchronise(device)
-        seconds.append(time.perf_counter() - began)
+        seconds.append(now(device) - began)
     return 2 * side**3 / min(seconds)

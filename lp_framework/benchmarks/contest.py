@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -10,7 +9,8 @@ from typing import Any
 
 import torch
 
-from lp_framework.benchmarks.section import Figure, Section, synchronise
+from lp_framework.benchmarks.section import Figure, Section
+from lp_framework.clock import now
 
 Work = Callable[[], float]  # does it, and says how many of the figure's unit were done
 
@@ -52,11 +52,9 @@ def compete(
 
 def timed(work: Work, device: torch.device) -> tuple[float, float]:
     """Seconds of a piece of work, and what it returns."""
-    synchronise(device)
-    began = time.perf_counter()
+    began = now(device)
     amount = work()
-    synchronise(device)
-    return time.perf_counter() - began, amount
+    return now(device) - began, amount
 
 
 def _section(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import torch
+from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 
 from lp_framework.benchmarks.contest import Match, Work, compete
@@ -60,8 +61,7 @@ def measure(
 
 def images_of(batch: PairBatch, device: torch.device) -> Tensor:
     """The images of a batch, `[I, 3, H, W]`."""
-    assert batch.images is not None  # no features are cached here
-    return batch.images.to(device)
+    return move_data_to_device(batch, device).images
 
 
 @torch.no_grad()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from statistics import median
 
@@ -10,7 +9,8 @@ import numpy as np
 import torch
 from lightning.fabric.utilities import move_data_to_device
 
-from lp_framework.benchmarks.section import Figure, Section, synchronise
+from lp_framework.benchmarks.section import Figure, Section
+from lp_framework.clock import now
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData
 from lp_framework.models.pose_model import PoseModel
 
@@ -38,14 +38,13 @@ def measure(
         kept[name] = storage / pairs
     for number in range(rounds):
         for name, batches in contenders.items():
-            began = time.perf_counter()
+            began = now(device)
             done = 0
             for _ in range(steps):
                 batch = next(batches)
                 _step(model, optimizer, batch, device)
                 done += len(batch)
-            synchronise(device)
-            seconds[name].append((time.perf_counter() - began) / done)
+            seconds[name].append((now(device) - began) / done)
         yield _section(seconds, kept, (number + 1) / rounds, note)
 
 
@@ -78,9 +77,8 @@ def plain_pairs(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
         drawn = everything[random.choice(len(everything), batch_pairs, replace=False)]
         singles = [data[pair[None]] for pair in drawn]
         offsets = 2 * torch.arange(batch_pairs)
-        images = [single.images for single in singles if single.images is not None]
         yield PairBatch(
-            images=torch.cat(images),
+            pixels=torch.cat([single.pixels for single in singles if single.pixels is not None]),
             features=None,
             poses=torch.cat([single.poses for single in singles]),
             cameras=torch.cat([single.cameras for single in singles]),
@@ -93,7 +91,6 @@ def plain_pairs(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
 
 def _loss(model: PoseModel, batch: PairBatch, device: torch.device) -> torch.Tensor:
     batch = move_data_to_device(batch, device)
-    assert batch.images is not None  # no features are cached here
     features = model.encode(batch.images)
     true = batch.relative_poses()
     condition = model.condition(features[batch.reference], features[batch.query])

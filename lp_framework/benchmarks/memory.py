@@ -11,8 +11,6 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from lp_framework.benchmarks.section import synchronise
-
 
 def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
     """Bytes that the tensors made by some work take at most at once, beyond those that were there before.
@@ -21,11 +19,11 @@ def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
     are gone (which takes time: do not clock it). What a kernel needs for itself is in the first alone.
     """
     if device.type == "cuda":
-        synchronise(device)
+        torch.cuda.synchronize(device)
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
         work()
-        synchronise(device)
+        torch.cuda.synchronize(device)
         return torch.cuda.max_memory_allocated(device) - before
     with _Followed() as followed:
         work()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
@@ -13,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from lp_framework.benchmarks.arithmetic import Arithmetic, counted, peak
-from lp_framework.benchmarks.section import Figure, Section, synchronise
+from lp_framework.benchmarks.section import Figure, Section
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.zero123.attention import Attention
@@ -148,10 +148,9 @@ class SecondStage:
         work = self.work()
         batch_prior, loop_prior = self.priors()
         pair = random_pair(self.device)
-        began = time.perf_counter()
+        began = now(self.device)
         energy = PairEnergy(batch_prior, pair, seed=0)
-        synchronise(self.device)
-        encoding = time.perf_counter() - began
+        encoding = now(self.device) - began
         ring = {count: Ring(count).make(pair.ids, seed=0) for count in self.starts}
         batched = {count: Batched(energy, starts) for count, starts in ring.items()}
         loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(self.starts)][0]]
@@ -211,15 +210,13 @@ class SecondStage:
     def run(self, runner: Batched | PlainLoop, prior: Zero123Prior) -> tuple[float, int]:
         """Seconds of `steps` steps, and on a GPU the peak of memory in bytes: this contender's weights and its work."""
         cuda = self.device.type == "cuda"
-        synchronise(self.device)
+        began = now(self.device)
         if cuda:
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
-        began = time.perf_counter()
         for _ in range(self.steps):
             runner.step()
-        synchronise(self.device)
-        seconds = time.perf_counter() - began
+        seconds = now(self.device) - began
         if not cuda:
             return seconds, 0
         weights = sum(each.nbytes for each in prior.parameters())

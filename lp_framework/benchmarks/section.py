@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-
 
 @dataclass(frozen=True)
 class Figure:
@@ -33,9 +31,3 @@ class Section:
     record: Mapping[str, Any]
     done: float
     note: str = ""
-
-
-def synchronise(device: torch.device) -> None:
-    """Wait until a GPU has done what it was told, so that a clock can be read."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning import Trainer
 from lightning.pytorch.callbacks import RichProgressBar
@@ -38,11 +39,12 @@ from lp_framework.evaluation.journal import Journal, goes_on, unfinished
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.solvers.base import Solver
+from lp_framework.solvers.starts import Starts
 from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.pictures import save_pictures, save_summaries
 
 LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and many would be long unsaved
-LARGE_PAIRS = 4  # pairs a batch with networks that are large
+LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 starts, 18 from 2
 
 
 @orderly_console()
@@ -71,6 +73,7 @@ def run(config: DictConfig) -> None:
     trainer = build_trainer(config, folder, [RichProgressBar(leave=False)], logger=[])
     evaluation = build_evaluation(config, solver, data, journal)
     trainer.test(evaluation, datamodule=data, verbose=False)
+    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather
     result = {
         **evaluation.result(),
         "protocol": config.protocol if config.views is None else "view_sets",
@@ -87,7 +90,8 @@ def run(config: DictConfig) -> None:
 
 def build_evaluation(config: DictConfig, solver: Solver, data: PairDataModule, journal: Journal) -> Evaluation:
     """The evaluation of a config, on pairs or on sets of views, with the data set to it."""
-    starts, batch_pairs = registry.build("start", config.start), pairs_at_once(config, solver)
+    starts = registry.build("start", config.start)
+    batch_pairs = pairs_at_once(config, solver, starts)
     if config.views is None:
         data.evaluate_on(config.protocol, config.seed, batch_pairs)
         return Evaluation(solver, starts, config.seed, journal)
@@ -97,11 +101,14 @@ def build_evaluation(config: DictConfig, solver: Solver, data: PairDataModule, j
     return ViewSetEvaluation(solver, starts, config.seed, config.views, journal)
 
 
-def pairs_at_once(config: DictConfig, solver: Solver) -> int:
+def pairs_at_once(config: DictConfig, solver: Solver, starts: Starts) -> int:
     """Pairs a batch: `batch_pairs`, else by the size of the solver's networks. A batch is saved when it is solved."""
     if config.batch_pairs is None:
         parameters = sum(each.numel() for network in solver.networks() for each in network.parameters())
-        return LARGE_PAIRS if parameters > LARGE else EVALUATION_PAIRS
+        if parameters <= LARGE:
+            return EVALUATION_PAIRS
+        count = starts.make(torch.zeros(1, dtype=torch.int64), config.seed).shape[1]
+        return max(1, LARGE_SAMPLES // solver.samples_per_pair(count))
     if not isinstance(config.batch_pairs, int) or config.batch_pairs < 1:
         raise UserError(f"batch_pairs must be a number of pairs, or null; got {config.batch_pairs}")
     return config.batch_pairs
@@ -111,7 +118,6 @@ def write_all(
     folder: Path, result: dict[str, Any], trainer: Trainer, evaluation: Evaluation, views: PairData, journal: Journal
 ) -> None:
     """Results, pictures and page; the first process writes them, once the results are those of all."""
-    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU; the pictures solve some pairs again
     save = save_summaries if isinstance(evaluation, ViewSetEvaluation) else save_pictures
     divided = evaluation.device_mesh is not None  # a prior that needs every process, for the pictures too
     if trainer.is_global_zero:

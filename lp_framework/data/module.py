@@ -30,6 +30,9 @@ class FeatureExtractor(Protocol):
     def trunk(self, images: Tensor) -> Tensor:
         """Features `[I, trunk_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
 
+    def to(self, device: torch.device) -> object:
+        """Move it there."""
+
     def fingerprint(self) -> str:
         """A text that changes when the trunk's output for some image would."""
 
@@ -143,11 +146,11 @@ class PairDataModule(LightningDataModule):
     def _features(self, key: str, images: NDArray) -> NDArray | None:
         if self._extractor is None:
             return None
-        extractor = self._extractor
+        extractor, device = self._extractor, self._device()
         shape = (len(images), extractor.trunk_dim)
         feature_key = content_key([], "features", key, extractor.fingerprint())
         return cached_array(
-            self.cache, feature_key, shape, np.float32, lambda array: _extract(extractor, images, array)
+            self.cache, feature_key, shape, np.float32, lambda array: _extract(extractor, images, array, device)
         )
 
     # ------------------------------------------------------------ batches
@@ -165,6 +168,10 @@ class PairDataModule(LightningDataModule):
         place = {file: row for row, file in enumerate(files)}
         rows = np.array([place[file] for file in table.files])
         return PairData(table, Rows(images, rows), None if features is None else Rows(features, rows))
+
+    def _device(self) -> torch.device:
+        """Where the networks are going to be."""
+        return self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
@@ -210,6 +217,9 @@ def _folder(split: str) -> str:
 
 
 @torch.inference_mode()
-def _extract(extractor: FeatureExtractor, images: NDArray, array: NDArray, batch: int = 32) -> None:
+def _extract(extractor: FeatureExtractor, images: NDArray, array: NDArray, device: torch.device) -> None:
+    batch = 32 if device.type == "cpu" else 256
+    extractor.to(device)
     for start in tracked(range(0, len(images), batch), "computing features"):
-        array[start : start + batch] = extractor.trunk(as_images(images[start : start + batch])).numpy()
+        pixels = torch.tensor(images[start : start + batch]).to(device)  # a copy: the cache is read-only
+        array[start : start + batch] = extractor.trunk(as_images(pixels)).cpu().numpy()

@@ -23,12 +23,12 @@ PROTOCOLS = ("ordered", "per_view", "ifusion")
 class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
-    `images` `[I, 3, H, W]` in [-1, 1], or `features` `[I, D]` that a frozen backbone computed from them; `poses`
-    `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`; `reference`, `query` `[P]`
-    into the views; `pairs` `[P]` indices of the pairs in the data set.
+    `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, D]` that a frozen backbone computed from them; `poses` `[I, 3]`
+    view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`; `reference`, `query` `[P]` into the
+    views; `pairs` `[P]` indices of the pairs in the data set.
     """
 
-    images: Tensor | None
+    pixels: Tensor | None
     features: Tensor | None
     poses: Tensor
     cameras: Tensor
@@ -39,6 +39,12 @@ class PairBatch:
 
     def __len__(self) -> int:
         return len(self.reference)
+
+    @property
+    def images(self) -> Tensor:
+        """`[I, 3, H, W]` in [-1, 1], made where the pixels are: a device is sent a quarter of the bytes."""
+        assert self.pixels is not None  # a batch has features or them
+        return as_images(self.pixels)
 
     def relative_poses(self) -> Tensor:
         """True relative poses `[P, 3]`, float32."""
@@ -148,9 +154,9 @@ class PairData(Dataset[PairBatch]):
         place = place.reshape(pairs.shape)
         index = torch.from_numpy(views)
         features = None if self.features is None else torch.from_numpy(self.features[views])
-        images = None if self.images is None or features is not None else as_images(self.images[views])
+        pixels = None if self.images is None or features is not None else torch.from_numpy(self.images[views])
         return PairBatch(
-            images=images,
+            pixels=pixels,
             features=features,
             poses=self.table.poses[index],
             cameras=self.table.cameras[index],
@@ -161,9 +167,9 @@ class PairData(Dataset[PairBatch]):
         )
 
 
-def as_images(pixels: NDArray) -> Tensor:
+def as_images(pixels: Tensor) -> Tensor:
     """Images `[I, 3, H, W]` in [-1, 1] from pixels `[I, H, W, 3]` (uint8)."""
-    return torch.tensor(pixels).permute(0, 3, 1, 2).float() / 127.5 - 1  # a copy: the cache is read-only
+    return pixels.permute(0, 3, 1, 2).float() / 127.5 - 1
 
 
 class BlockSampler(Sampler[NDArray[np.int64]]):

@@ -122,7 +122,6 @@ class PoseModel(TrainedModule):
         if batch.features is not None:
             features: Tensor = self.backbone.head(batch.features)
             return features
-        assert batch.images is not None  # a batch has one or the other
         return self.encode(batch.images)
 
     def _validation_noise(self, true: Tensor, pairs: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
 
     `readout` `[I, 4]` of the views: real and imaginary part of the longitude's phase, scaled latitude and radius.
     """
-    true = batch.relative_poses()
+    readout, true = readout.float(), batch.relative_poses()  # complex numbers have no bfloat16
     phase = torch.complex(readout[:, 0], readout[:, 1])
     turn = phase[batch.query] * phase[batch.reference].conj()
     difference = readout[batch.query, 2:] - readout[batch.reference, 2:]
@@ -41,4 +41,4 @@ class ViewHead(nn.Module):
 
     def loss(self, features: Tensor, batch: PairBatch) -> Tensor:
         """See `relative_pose_loss`."""
-        return relative_pose_loss(self.readout(features).float(), batch)
+        return relative_pose_loss(self.readout(features), batch)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch, ViewTable
@@ -38,9 +39,9 @@ class Pairs:
 
 def pairs_of(batch: PairBatch, table: ViewTable, device: torch.device) -> Pairs:
     """The pairs of a batch of the views in `table`, on a device. The batch has images: nothing caches features."""
-    assert batch.images is not None
-    ids = table.pair_ids(batch.pairs)
-    return Pairs(*(each.to(device) for each in (batch.images, batch.reference, batch.query, ids)))
+    ids = table.pair_ids(batch.pairs).to(device)
+    batch = move_data_to_device(batch, device)
+    return Pairs(batch.images, batch.reference, batch.query, ids)
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,10 @@ class Solver(ABC):
     def networks(self) -> list[nn.Module]:
         """The networks that it was given, to be moved to a device."""
         return [part for part in vars(self).values() if isinstance(part, nn.Module)]
+
+    def samples_per_pair(self, starts: int) -> int:
+        """Samples of a pair that pass the prior at once in the longest loop: of each start both directions."""
+        return 2 * starts
 
     @abstractmethod
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
 from lp_framework.models.pose_model import PoseModel
@@ -85,7 +85,7 @@ class GaussNewton(Solver):
     def refine(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """The second stage alone, from starts `[B, N, 3]`."""
         check_starts(pairs, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
         noise = energy.noise(0, len(self.timesteps))
         pose = _plausible(starts.clone())
@@ -123,7 +123,7 @@ class GaussNewton(Solver):
             energies=energies,
             valid=valid,
             chosen=choose(energies),
-            cost=Cost(energy.passes, time.perf_counter() - began),
+            cost=Cost(energy.passes, now(starts.device) - began),
             trajectory=torch.stack(path, dim=2) if self.trajectory else None,
         )
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
 from lp_framework.keyed_random import keyed_uniform
@@ -111,12 +111,16 @@ class IDPose(Solver):
         self.refinement_steps, self.refinement_rate, self.averaged = refinement_steps, refinement_rate, averaged
         self.trajectory = trajectory
 
+    def samples_per_pair(self, starts: int) -> int:
+        """See `Solver`: the refinement is of one pose, in one direction a step."""
+        return 1
+
     @torch.inference_mode(False)
     @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve` and the class."""
         check_starts(pairs, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
         found = self._explore(energy, starts)
         chosen = choose(found.energies)
@@ -136,7 +140,7 @@ class IDPose(Solver):
             energies=found.energies,
             valid=valid,
             chosen=chosen,
-            cost=Cost(network_passes=energy.passes, seconds=time.perf_counter() - began),
+            cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
             trajectory=path,
         )
 
@@ -148,7 +152,7 @@ class IDPose(Solver):
         The energies are those of the chosen candidates before refinement.
         """
         check_view_starts(view_sets, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         sets, views = view_sets.views.shape
         others = list(range(1, views))
         energy = PairEnergy(self.prior, view_sets.pairs([0] * len(others), others), seed)
@@ -169,7 +173,7 @@ class IDPose(Solver):
             poses=_reduced(refined.poses),
             energies=energies,
             valid=refined.valid & energies[:, 0, 1:].isfinite().all(dim=1),
-            cost=Cost(network_passes=energy.passes, seconds=time.perf_counter() - began),
+            cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
         )
 
     # ------------------------------------------------------------ exploration

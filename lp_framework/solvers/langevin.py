@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
 from lp_framework.keyed_random import keyed_normal
@@ -46,7 +46,7 @@ class Langevin(Solver):
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start is invalid when its pose is not finite."""
         check_starts(pairs, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         features = self.model.encode(pairs.images)
         condition = self.model.condition(features[pairs.reference], features[pairs.query])[:, None]  # [B, 1, hidden]
         pose, path = starts, [starts]
@@ -65,7 +65,7 @@ class Langevin(Solver):
             energies=energies,
             valid=pose.isfinite().all(dim=-1),
             chosen=choose(energies),
-            cost=Cost(network_passes=passes, seconds=time.perf_counter() - began),
+            cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
             trajectory=torch.stack(path, dim=2) if self.trajectory else None,
         )
 

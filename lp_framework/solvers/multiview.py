@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from itertools import combinations, permutations
 from typing import NamedTuple
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
@@ -102,7 +102,7 @@ class MultiView(Solver):
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`: each pair as a set of two images; one pose a pair, or one a start without first stage."""
         check_starts(pairs, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         view_sets = ViewSets(pairs.images, torch.stack([pairs.reference, pairs.query], dim=1), pairs.ids)
         joint = self._solve(view_sets, starts[:, None], seed)
         energies = (joint.energies[..., 0, 1] + joint.energies[..., 1, 0]) / 2
@@ -111,13 +111,13 @@ class MultiView(Solver):
             energies=energies,
             valid=joint.valid,
             chosen=choose(energies.masked_fill(~joint.valid, torch.nan)),
-            cost=Cost(joint.passes, time.perf_counter() - began),
+            cost=Cost(joint.passes, now(starts.device) - began),
         )
 
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """See `Solver.solve_views`. A set is invalid when model or prior failed so that an image's pose is unknown."""
         check_view_starts(view_sets, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         joint = self._solve(view_sets, starts, seed)
         chosen = choose(joint.energies.nansum(dim=(-2, -1)).masked_fill(~joint.valid, torch.nan))
         sets = torch.arange(len(view_sets), device=chosen.device)
@@ -125,7 +125,7 @@ class MultiView(Solver):
             poses=joint.poses[sets, chosen],
             energies=joint.energies[sets, chosen],
             valid=joint.valid[sets, chosen],
-            cost=Cost(joint.passes, time.perf_counter() - began),
+            cost=Cost(joint.passes, now(starts.device) - began),
         )
 
     @torch.inference_mode(False)

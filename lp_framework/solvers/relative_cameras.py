@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 
 import torch
 from torch import Tensor
 
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.geometry import pose_of_relative_camera
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts
@@ -37,7 +37,7 @@ class RelativeCameraSolver(Solver):
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve` and the class."""
         check_starts(pairs, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         cameras, energies, passes = self.predict(pairs, seed)
         poses = pose_of_relative_camera(cameras, self.reference_radius)
         return Solution(
@@ -45,6 +45,6 @@ class RelativeCameraSolver(Solver):
             energies=energies.to(starts)[:, None],
             valid=cameras.isfinite().all(dim=-1).all(dim=-1).to(starts.device)[:, None],
             chosen=torch.zeros(len(pairs), dtype=torch.int64, device=starts.device),
-            cost=Cost(network_passes=passes, seconds=time.perf_counter() - began),
+            cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
             cameras=cameras.to(starts)[:, None],
         )

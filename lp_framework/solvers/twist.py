@@ -8,13 +8,13 @@ longitude and norm are read back from the translation of T.
 from __future__ import annotations
 
 import math
-import time
 from abc import ABC, abstractmethod
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from lp_framework.clock import now
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, se3_exp, view_pose
 from lp_framework.priors.base import Prior
@@ -141,7 +141,7 @@ class TwistDescent(Solver):
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
         check_starts(pairs, starts)
-        began = time.perf_counter()
+        began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
         twist = starts.new_zeros(*starts.shape[:2], 6)
         adam = Adam(twist, self.learning_rate)
@@ -169,6 +169,6 @@ class TwistDescent(Solver):
             energies=energies,
             valid=valid,
             chosen=choose(energies),
-            cost=Cost(network_passes=energy.passes, seconds=time.perf_counter() - began),
+            cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
             trajectory=unwrapped(path) if self.trajectory else None,
         )

@@ -34,6 +34,10 @@ class TrunkAndPixels:
         """`[I, trunk_dim]` of images `[I, 3, H, W]`."""
         return torch.cat([self.backbone.trunk(images), shrink(images)], dim=1)
 
+    def to(self, device: torch.device) -> object:
+        """See `FeatureExtractor`."""
+        return self.backbone.to(device)
+
     def fingerprint(self) -> str:
         """See `FeatureExtractor`."""
         return f"{self.backbone.fingerprint()} and pixels"
@@ -127,7 +131,6 @@ class PriorModel(TrainedModule):
     def _features(self, batch: PairBatch) -> Tensor:
         """Features of the batch's views, by the head of the backbone or all of it."""
         if batch.features is None:
-            assert batch.images is not None  # a batch has one or the other
             return self.backbone(batch.images)
         features: Tensor = self.backbone.head(batch.features[:, : self.backbone.trunk_dim])
         return features
@@ -135,7 +138,6 @@ class PriorModel(TrainedModule):
     def _pixels(self, batch: PairBatch) -> Tensor:
         """Pixels of the batch's views, small."""
         if batch.features is None:
-            assert batch.images is not None
             return shrink(batch.images)
         return batch.features[:, self.backbone.trunk_dim :]
 
