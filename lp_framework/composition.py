@@ -51,6 +51,20 @@ def group_names() -> list[str]:
     return sorted({*registry.GROUPS, *(each.name for each in folders if each.is_dir())} - {"hydra"})
 
 
+def experiments(command: str) -> list[str]:
+    """The experiments that go with a command: it has all the groups from which they choose."""
+    folders = conf_folders(RegistrySearchPath.config_dir)
+    groups = _defaults(conf_dir() / f"{command}.yaml")
+    found = {file.stem: _defaults(file) for folder in folders for file in folder.glob("experiment/*.yaml")}
+    chosen = {name: {key.partition("override /")[2] for key in keys} - {""} for name, keys in found.items()}
+    return sorted(name for name, wanted in chosen.items() if {"experiment", *wanted} <= groups)
+
+
+def _defaults(file: Path) -> set[str]:
+    """The groups in the defaults list of a file."""
+    return {str(key) for each in _load(file).get("defaults", []) if isinstance(each, DictConfig) for key in each}
+
+
 # ---------------------------------------------------------------- nodes of the registry's groups
 
 

@@ -7,6 +7,7 @@ import difflib
 import importlib
 import logging
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +19,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import (
@@ -31,7 +32,8 @@ from omegaconf.errors import (
 from yaml import YAMLError
 
 from lp_framework import registry
-from lp_framework.composition import RegistrySearchPath, RegistrySource, conf_dir, group_names, one_line
+from lp_framework.cli import COMMANDS
+from lp_framework.composition import RegistrySearchPath, RegistrySource, conf_dir, experiments, group_names, one_line
 from lp_framework.errors import UserError, nearest
 
 log = logging.getLogger(__name__)
@@ -81,6 +83,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
     try:
         with _set_up_for_hydra(arguments):
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command)(task)()
+    except ConfigCompositionException as error:
+        raise UsageError(_wrong_experiment(command, str(error)) or _explain(error)) from error
     except (HydraException, YAMLError, MissingMandatoryValue, InterpolationResolutionError) as error:
         raise UsageError(_explain(error)) from error
     except UserError:
@@ -224,6 +228,19 @@ def _explain(error: Exception) -> str:
             as_list = "" if key in group_names() else f", or write a list, {key}=[{values}]"
             return f"'{override}' has several values: add --multirun to run each{as_list}"
     return one_line(error)
+
+
+def _wrong_experiment(command: str, message: str) -> str | None:
+    """What to say where an experiment chooses from a group that the command has not."""
+    found = re.match(r"In 'experiment/(.+?)': Could not override '.+'\. No match in the defaults list", message)
+    if found is None:
+        return None
+    name = found[1]
+    others = " or ".join(
+        each for each in COMMANDS if (conf_dir() / f"{each}.yaml").is_file() and name in experiments(each)
+    )
+    goes = f"; it goes with {others}" if others else ""
+    return f"experiment={name}: is none of {command}'s ({_known(experiments(command))}){goes}"
 
 
 def _place(error: Exception) -> str:

@@ -97,6 +97,13 @@ def test_an_experiment_holds_differences(lp, walker):
     assert config_of(lp(*DEMO, "experiment=hike", "solver.steps=5", "--cfg", "job"))["solver"]["steps"] == 5
 
 
+def test_an_experiment_of_another_command_says_whose_it_is(lp):
+    finished = lp("figure", "experiment=gamma")
+    assert finished.status == 2
+    assert finished.error.startswith("experiment=gamma: is none of figure's (known: figure_cameras, ")
+    assert finished.error.endswith("; it goes with eval or estimate or landscape")
+
+
 def test_a_yaml_may_choose_a_member_of_another_group(lp, walker, write):
     write("configs/solver/walk.yaml", "defaults: [{/model@_global_.second: net}]\nsteps: 9\n")
     config = config_of(lp(*DEMO, "--cfg", "job"))

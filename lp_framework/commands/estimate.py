@@ -84,9 +84,6 @@ def run(config: DictConfig) -> None:
     seed_run(config.seed)
     first = _reference_pose(config.latitude_degrees, config.radius)
     device = choose_device(config.accelerator)
-    for key in ("remove_background", "crop"):
-        if not isinstance(config[key], bool):
-            raise UserError(f"{key} must be true or false, got {config[key]}")
     files = photograph_files(config.images)
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
 

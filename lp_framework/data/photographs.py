@@ -249,6 +249,9 @@ def prepared_photographs(
 
     All are read before the first is prepared, so that what is wrong with any file shows before anything takes long.
     """
+    for name, value in (("remove_background", remove_background), ("crop", crop)):
+        if not isinstance(value, bool):
+            raise UserError(f"{name} must be true or false, got {value}")
     found = [None] * len(files) if masks is None else mask_files(files, masks)
     images = [read_image(file) for file in files]
     opened = [None if mask is None else read_image(mask) for mask in found]
