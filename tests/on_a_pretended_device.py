@@ -34,7 +34,7 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.viz.pictures import save_pictures
 
 ON_HOST = ("dust3r", "features", "vggt")  # matching and other people's packages compute in NumPy, or by themselves
-FORWARD_MODE = ("gauss_newton",)  # PyTorch's forward-mode derivatives do not pass through a device written in Python
+FORWARD_MODE = ("gauss_newton",)  # its derivatives do not pass through a device written in Python; see its own tests
 PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1", "data.image_size=64")
 
 

@@ -243,3 +243,15 @@ def test_it_works_in_inference_mode():
 def test_bad_settings_are_named(settings, message):
     with pytest.raises(UserError, match=message):
         GaussNewton(ExactModel(), ExactPrior(), **settings)
+
+
+def test_no_step_waits_for_the_device_or_mixes_devices(monkeypatch):
+    """On the meta device, where a value that is asked for and a tensor from elsewhere are errors."""
+    meta = torch.device("meta")
+    pairs, true = exact_pairs(2)
+    there = Pairs(*(each.to(meta) for each in vars(pairs).values()))
+    monkeypatch.setattr("lp_framework.solvers.gauss_newton.check_starts", lambda pairs, starts: None)  # looks at values
+    solution = GaussNewton(ExactModel(), ExactPrior().to(meta)).refine(there, around(true, 0.3).to(meta), seed=0)
+    assert solution.poses.device == meta and solution.poses.shape == (2, 1, 3)
+    with pytest.raises(RuntimeError, match="device"):
+        GaussNewton(ExactModel(), ExactPrior().to(meta)).refine(there, around(true, 0.3), seed=0)
