@@ -138,17 +138,17 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             log.log(logging.ERROR if sweep else logging.INFO, "%s failed", command, exc_info=True)
             raise
         finally:
-            if sweep:
-                _forget_processes(environment)
+            _leave_processes()
+            if sweep:  # the next job would take what Lightning leaves of this one's processes for its own
+                os.environ.clear()
+                os.environ.update(environment)
 
     task.__module__ = f"lp_framework.commands.{command}"  # gives the job its name
     return task
 
 
-def _forget_processes(environment: dict[str, str]) -> None:
-    """Undo what Lightning leaves of a job's several processes; the sweep's next job would take it for its own."""
-    os.environ.clear()
-    os.environ.update(environment)
+def _leave_processes() -> None:
+    """End what a job's several processes speak by, whose threads would be cut off at the process's end."""
     distributed = sys.modules.get("torch.distributed")
     if distributed is not None and distributed.is_available() and distributed.is_initialized():
         distributed.destroy_process_group()

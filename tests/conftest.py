@@ -21,6 +21,7 @@ torchvision_ops.install()
 settings.register_profile("same", derandomize=True, database=None, deadline=None)
 settings.load_profile("same")
 ROOT = Path(__file__).parents[1]
+collect_ignore = ["pretended_device.py", "on_a_pretended_device.py"]  # they have a process of their own
 
 
 @dataclass

@@ -20,7 +20,9 @@ CHECKS = Path(__file__).with_name("on_a_pretended_device.py")
     reason="this PyTorch knows no devices that are written in Python",
 )
 def test_commands_and_solvers_run_on_another_device(tmp_path):
-    line = [sys.executable, "-m", "pytest", "--quiet", "-p", "no:cacheprovider", f"--basetemp={tmp_path}", str(CHECKS)]
+    # Without conftest.py, which keeps these checks from being collected; importing the package mends torchvision.
+    options = ["--quiet", "--noconftest", "-p", "lp_framework", "-p", "no:cacheprovider", f"--basetemp={tmp_path}"]
+    line = [sys.executable, "-m", "pytest", "-o", "addopts=--import-mode=importlib", *options, str(CHECKS)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     ran = subprocess.run(line, cwd=CHECKS.parents[1], env=environment, capture_output=True, text=True, timeout=900)
     assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -153,10 +153,10 @@ def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(
     model = Share(registry.build("backbone", {"name": "tmp_tiny"}), hidden=16, schedule="constant")
     model.load_state_dict(initial.checkpoint()["state_dict"], strict=False)  # the trunk is not among them
     optimizer = model.configure_optimizers()
-    loaders = []
+    loaders, here = [], SimpleNamespace(root_device=torch.device("cpu"))
     for rank in (0, 1):
         data = PairDataModule(str(commands.folder / "views"), str(tmp_path / "cache"), 16, 40, 3, 2, 0)
-        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2, strategy=here)
         data.cache_features(model.extractor())
         loaders.append(data.train_dataloader())
     sizes = set()
