@@ -23,7 +23,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -61,8 +61,13 @@ def experiments(command: str) -> list[str]:
 
 
 def _defaults(file: Path) -> set[str]:
-    """The groups in the defaults list of a file."""
-    return {str(key) for each in _load(file).get("defaults", []) if isinstance(each, DictConfig) for key in each}
+    """The groups in the defaults list of a file; none of a file that has no such list."""
+    try:
+        defaults = _load(file).get("defaults")
+    except (UserError, OSError, UnicodeDecodeError):
+        return set()
+    entries = defaults if isinstance(defaults, ListConfig) else []
+    return {str(key) for each in entries if isinstance(each, DictConfig) for key in each}
 
 
 # ---------------------------------------------------------------- nodes of the registry's groups

@@ -148,7 +148,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
 
 
 def _leave_processes() -> None:
-    """End what a job's several processes speak by, whose threads would be cut off at the process's end."""
+    """End what a job's several processes speak by: its threads do not survive being cut off when this one ends."""
     distributed = sys.modules.get("torch.distributed")
     if distributed is not None and distributed.is_available() and distributed.is_initialized():
         distributed.destroy_process_group()

@@ -97,10 +97,13 @@ def test_an_experiment_holds_differences(lp, walker):
     assert config_of(lp(*DEMO, "experiment=hike", "solver.steps=5", "--cfg", "job"))["solver"]["steps"] == 5
 
 
-def test_an_experiment_of_another_command_says_whose_it_is(lp):
-    finished = lp("figure", "experiment=gamma")
+def test_an_experiment_of_another_command_says_whose_it_is(lp, write):
+    for name, content in (("odd", "defaults: 3"), ("empty", "defaults:"), ("list", "[1]"), ("broken", "{")):
+        write(f"odd/experiment/{name}.yaml", f"{content}\n")
+    finished = lp("figure", "experiment=gamma", "--config-dir", "odd")
     assert finished.status == 2
-    assert finished.error.startswith("experiment=gamma: is none of figure's (known: figure_cameras, ")
+    assert finished.error.startswith("experiment=gamma: is none of figure's (known: ")
+    assert "figure_cameras, " in finished.error and "stages" not in finished.error
     assert finished.error.endswith("; it goes with eval or estimate or landscape")
 
 

@@ -200,6 +200,33 @@ def test_features_are_computed_once_and_are_the_backbones(make):
     assert extractor.shown == 3 * (12 + 4)
 
 
+class Moving(torch.nn.Module):
+    """A backbone that is really moved, if only to another type; its head is to be trained afterwards."""
+
+    trunk_dim = 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.head = torch.nn.Linear(3, 2)
+
+    def to(self, device: torch.device) -> object:
+        return self.double()
+
+    def trunk(self, images: torch.Tensor) -> torch.Tensor:
+        return images.mean(dim=(2, 3))
+
+    def fingerprint(self) -> str:
+        return "moving"
+
+
+def test_what_was_moved_to_compute_features_can_still_be_trained(make):
+    backbone, data = Moving(), make()
+    data.cache_features(backbone)
+    data.prepare_data()
+    assert backbone.head.weight.dtype == torch.float64
+    assert not any(parameter.is_inference() for parameter in backbone.parameters())
+
+
 def test_features_belong_to_the_weights_and_the_images(make):
     first, other = Means(1.0), Means(-2.0)
     for extractor in (first, other, first):

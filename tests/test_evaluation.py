@@ -200,7 +200,7 @@ def test_two_processes_give_every_number_of_one(evaluated, commands):
 
 
 @pytest.mark.parametrize(
-    ("solver", "starts", "pairs"), [("ifusion", 9, 4), ("two_stage", 2, 18), ("ifusion", 100, 1), ("id_pose", 9, 72)]
+    ("solver", "starts", "pairs"), [("ifusion", 9, 4), ("two_stage", 2, 18), ("ifusion", 100, 1), ("id_pose", 9, 7)]
 )
 def test_a_batch_of_pairs_fills_a_large_prior_and_no_more(monkeypatch, solver, starts, pairs):
     config = OmegaConf.create({"batch_pairs": None, "seed": 0})
@@ -208,6 +208,11 @@ def test_a_batch_of_pairs_fills_a_large_prior_and_no_more(monkeypatch, solver, s
     assert pairs_at_once(config, built, Ring(starts)) == EVALUATION_PAIRS
     monkeypatch.setattr("lp_framework.commands.eval.LARGE", -1)
     assert pairs_at_once(config, built, Ring(starts)) == pairs
+
+
+def test_poses_are_not_computed_in_less_than_float32(commands):
+    ran = commands.here("half", "eval", "checkpoint=score", "trainer.precision=bf16-mixed")
+    assert ran.error.startswith("trainer.precision: poses are computed in float32")
 
 
 def test_errors_compare_the_querys_predicted_camera_with_its_true_one():

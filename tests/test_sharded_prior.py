@@ -20,6 +20,7 @@ pytestmark = pytest.mark.skipif(
     not (torch.distributed.is_available() and torch.distributed.is_gloo_available()),
     reason="PyTorch was built without gloo, by which processes on CPUs speak",
 )
+ZERO123 = ("solver=ifusion", "prior=zero123", "prior.path=zero123")
 DIVIDED = ("trainer.devices=2", "trainer.strategy=model_parallel", "trainer.accelerator=cpu")
 
 SHARES = """
@@ -107,6 +108,11 @@ def test_an_evaluation_has_the_results_of_one_process(commands):
     [
         ("eval", ("solver=ifusion", "prior=tiny"), "TinyPrior cannot be divided among processes"),
         ("eval", ("solver=features",), "trainer.strategy=model_parallel divides a prior, and this solver has none"),
+        (
+            "eval",
+            (*ZERO123, "prior.channels_last=true"),
+            "prior.channels_last=true and trainer.strategy=model_parallel",
+        ),
         ("train", (), "trainer.strategy=model_parallel divides the prior of an eval; models are trained whole"),
     ],
 )

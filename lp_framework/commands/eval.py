@@ -59,6 +59,8 @@ def run(config: DictConfig) -> None:
         config, known = unfinished_evaluation(folder, config, HydraConfig.get().overrides.task)
     elif is_finished(folder, config):
         return
+    if config.trainer.get("precision", "32-true") != "32-true":
+        raise UserError("trainer.precision: poses are computed in float32; prior.dtype=bfloat16 is Zero123's own")
     seed_run(config.seed)
     solver, checkpoint = build_solver(config, known)
     subject = {

@@ -216,10 +216,10 @@ def _folder(split: str) -> str:
     return "test" if split == "test" else "train"
 
 
-@torch.inference_mode()
 def _extract(extractor: FeatureExtractor, images: NDArray, array: NDArray, device: torch.device) -> None:
     batch = 32 if device.type == "cpu" else 256
-    extractor.to(device)
-    for start in tracked(range(0, len(images), batch), "computing features"):
-        pixels = torch.tensor(images[start : start + batch]).to(device)  # a copy: the cache is read-only
-        array[start : start + batch] = extractor.trunk(as_images(pixels)).cpu().numpy()
+    extractor.to(device)  # not in inference mode: what is moved there cannot be trained any more
+    with torch.inference_mode():
+        for start in tracked(range(0, len(images), batch), "computing features"):
+            pixels = torch.tensor(images[start : start + batch]).to(device)  # a copy: the cache is read-only
+            array[start : start + batch] = extractor.trunk(as_images(pixels)).cpu().numpy()

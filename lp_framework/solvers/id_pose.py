@@ -112,8 +112,8 @@ class IDPose(Solver):
         self.trajectory = trajectory
 
     def samples_per_pair(self, starts: int) -> int:
-        """See `Solver`: the refinement is of one pose, in one direction a step."""
-        return 1
+        """See `Solver`; between the many candidates of the exploration and the one of the refinement."""
+        return 2 * self.kept
 
     @torch.inference_mode(False)
     @torch.no_grad()

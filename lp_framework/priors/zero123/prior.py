@@ -74,6 +74,8 @@ class Zero123Prior(Prior):
         """See `Prior.shard`: PyTorch's FSDP, block by block; a block's weights are gathered while it computes."""
         from torch.distributed.fsdp import fully_shard  # not in every build of PyTorch
 
+        if self.channels_last:
+            raise UserError("prior.channels_last=true and trainer.strategy=model_parallel do not go together")
         unet, encoder = self.unet, self.image_encoder.vision_model.encoder
         for block in (*unet.down_blocks, unet.mid_block, *unet.up_blocks, *encoder.layers):
             fully_shard(block, mesh=mesh)
