@@ -18,6 +18,12 @@ from lp_framework.data.pairs import PairBatch
 SCALE = (2.0, 3.0)
 
 
+def scaled(pose: Tensor) -> Tensor:
+    """Latitudes and radii `[..., 2]` of relative poses `[..., 3]`, each times its `SCALE`."""
+    # Times numbers: a tensor of them would be sent to the device at every step.
+    return torch.stack([pose[..., 0] * SCALE[0], pose[..., 2] * SCALE[1]], dim=-1)
+
+
 def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
     """Mean squared error of the relative pose over the batch's pairs, a scalar.
 
@@ -27,7 +33,7 @@ def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
     phase = torch.complex(readout[:, 0], readout[:, 1])
     turn = phase[batch.query] * phase[batch.reference].conj()
     difference = readout[batch.query, 2:] - readout[batch.reference, 2:]
-    error = difference - torch.stack([true[:, 0] * SCALE[0], true[:, 2] * SCALE[1]], dim=1)
+    error = difference - scaled(true)
     longitude = torch.view_as_real(turn - torch.polar(torch.ones_like(true[:, 1]), true[:, 1]))
     return longitude.square().sum(dim=-1).mean() + error.square().mean()
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lp_framework.models.view_head import SCALE
+from lp_framework.models.view_head import scaled
 from lp_framework.priors.tiny.latents import ImageDecoder, PrincipalLatents
 
 CONSTANT, WAVES = 64, 8  # numbers of a code that a turn leaves as they are; waves of each order
@@ -44,7 +44,7 @@ def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
     angle = pose[..., 1:2] * torch.arange(1, orders + 1, device=pose.device, dtype=pose.dtype)
     cosine, sine = angle.cos()[..., None], angle.sin()[..., None]
     turned = torch.stack([real * cosine - imaginary * sine, real * sine + imaginary * cosine], dim=-3)
-    moved = place + torch.stack([pose[..., 0] * SCALE[0], pose[..., 2] * SCALE[1]], dim=-1)
+    moved = place + scaled(pose)
     return torch.cat([constant.expand(*moved.shape[:-1], -1), turned.flatten(-3), moved], dim=-1)
 
 

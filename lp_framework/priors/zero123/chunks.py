@@ -70,7 +70,7 @@ class Chunks:
         return max(counts)
 
 
-STEEPER = 4096  # times the energy is differentiated: a power of two, which changes no digit, but float16's range
+STEEPER = 4096  # times the energy is differentiated, lest small slopes vanish in float16; a power of two is exact
 
 
 class EnergyAndSlope(torch.autograd.Function):
