@@ -52,22 +52,29 @@ def group_names() -> list[str]:
 
 
 def experiments(command: str) -> list[str]:
-    """The experiments that go with a command: it has all the groups from which they choose."""
-    folders = conf_folders(RegistrySearchPath.config_dir)
-    groups = _defaults(conf_dir() / f"{command}.yaml")
-    found = {file.stem: _defaults(file) for folder in folders for file in folder.glob("experiment/*.yaml")}
-    chosen = {name: {key.partition("override /")[2] for key in keys} - {""} for name, keys in found.items()}
-    return sorted(name for name, wanted in chosen.items() if {"experiment", *wanted} <= groups)
+    """The experiments that go with a command: it has all groups from which they choose, and they set nothing that other
+    commands have and it has not."""
+    commands = {file.stem: _keys(file) for file in conf_dir().glob("*.yaml")}
+    own = commands[command] | commands["base"]
+    others = {key for keys in commands.values() for key in keys} - own
+    found = {}
+    for folder in conf_folders(RegistrySearchPath.config_dir):
+        for file in folder.glob("experiment/*.yaml"):
+            keys = _keys(file)
+            chosen = {key.partition("override /")[2] for key in keys} - {""}
+            found[file.stem] = {"experiment", *chosen} <= own and not keys & others
+    return sorted(name for name, fits in found.items() if fits)
 
 
-def _defaults(file: Path) -> set[str]:
-    """The groups in the defaults list of a file; none of a file that has no such list."""
+def _keys(file: Path) -> set[str]:
+    """The keys of a file and the groups in its defaults list; none of a file that does not load."""
     try:
-        defaults = _load(file).get("defaults")
+        values = _load(file)
     except (UserError, OSError, UnicodeDecodeError):
         return set()
+    defaults = values.get("defaults")
     entries = defaults if isinstance(defaults, ListConfig) else []
-    return {str(key) for each in entries if isinstance(each, DictConfig) for key in each}
+    return {*map(str, values), *(str(key) for each in entries if isinstance(each, DictConfig) for key in each)}
 
 
 # ---------------------------------------------------------------- nodes of the registry's groups

@@ -84,7 +84,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
         with _set_up_for_hydra(arguments):
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command)(task)()
     except ConfigCompositionException as error:
-        raise UsageError(_wrong_experiment(command, str(error)) or _explain(error)) from error
+        name = options.get("--config-name", command)
+        raise UsageError(_wrong_experiment(name, str(error)) or _explain(error)) from error
     except (HydraException, YAMLError, MissingMandatoryValue, InterpolationResolutionError) as error:
         raise UsageError(_explain(error)) from error
     except UserError:
@@ -126,6 +127,8 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
         registry.discover(config.get("plugins", []))
         environment = dict(os.environ)
         try:
+            if mistaken := _misplaced(str(job.job.config_name), str(job.runtime.choices.get("experiment"))):
+                raise UsageError(mistaken)
             importlib.import_module(f"lp_framework.commands.{command}").run(config)
         except (UserError, MissingMandatoryValue, InterpolationResolutionError) as error:
             mistake = error if isinstance(error, UserError) else UserError(_explain(error))
@@ -231,16 +234,20 @@ def _explain(error: Exception) -> str:
 
 
 def _wrong_experiment(command: str, message: str) -> str | None:
-    """What to say where an experiment chooses from a group that the command has not."""
-    found = re.match(r"In 'experiment/(.+?)': Could not override '.+'\. No match in the defaults list", message)
-    if found is None:
+    """What to say where an experiment does not compose since it is another command's."""
+    found = re.match(r"In 'experiment/(.+?)': ", message)
+    return found and _misplaced(command, found[1])
+
+
+def _misplaced(command: str, experiment: str) -> str | None:
+    """A sentence where an experiment goes with other commands and not with this one; a config of your own has all."""
+    if command not in COMMANDS:
         return None
-    name = found[1]
-    others = " or ".join(
-        each for each in COMMANDS if (conf_dir() / f"{each}.yaml").is_file() and name in experiments(each)
-    )
-    goes = f"; it goes with {others}" if others else ""
-    return f"experiment={name}: is none of {command}'s ({_known(experiments(command))}){goes}"
+    others = [each for each in COMMANDS if (conf_dir() / f"{each}.yaml").is_file() and experiment in experiments(each)]
+    if not others or command in others:
+        return None
+    known = _known(experiments(command))
+    return f"experiment={experiment}: is none of {command}'s ({known}); it goes with {' or '.join(others)}"
 
 
 def _place(error: Exception) -> str:

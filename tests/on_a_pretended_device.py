@@ -256,7 +256,14 @@ def test_figures(commands, chosen, name):
 
 def test_bench(tmp_path, chosen):
     chosen()
-    names = ["encoding", "first_stage", "second_stage", "precision", "checkpoint"]  # others look at memory's addresses
+    names = [
+        "encoding",
+        "first_stage",
+        "second_stage",
+        "pair",
+        "precision",
+        "checkpoint",
+    ]  # others look at memory's addresses
     settings = {**FEW, "second_stage.architecture": "narrow", "second_stage.starts": "[1]", "second_stage.rounds": "1"}
     small = (f"{key}={value}" for key, value in settings.items())
     ran = Commands(tmp_path, train_views=6).here("bench", "bench", f"measure=[{','.join(names)}]", *small)

@@ -17,8 +17,9 @@ from zero123_checkpoint import state_dict, write_checkpoint
 
 from lp_framework import registry
 from lp_framework.benchmarks import arithmetic, contest, first_stage, loader, rendering, second_stage
+from lp_framework.benchmarks import pair as whole_pair
 from lp_framework.benchmarks.adam_gauss_newton import Encoded, followed, some_pairs
-from lp_framework.benchmarks.arithmetic import Arithmetic, Peak, counted
+from lp_framework.benchmarks.arithmetic import Arithmetic, Peak, counted, launched
 from lp_framework.benchmarks.contest import Match, compete
 from lp_framework.benchmarks.encoding import loss_on, trunk_features
 from lp_framework.benchmarks.first_stage import all_pairs
@@ -34,6 +35,7 @@ from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
+from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.priors.zero123.networks import Networks
 from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.solvers.base import Pairs
@@ -53,6 +55,7 @@ FEW = {
     "backbone.image_size": "32", "data.batch_pairs": "36", "data.block": "3", "data.validation_views": "0",
     "loader.rounds": "1", "loader.steps": "1", "encoding.rounds": "1",
     "first_stage.views": "2", "first_stage.starts": "1", "first_stage.rounds": "1",
+    "pair.starts": "[1,2]", "pair.steps": "2",
     "precision.architecture": "narrow", "precision.starts": "1", "precision.rounds": "1",
     "adam_gauss_newton.pairs": "2", "adam_gauss_newton.starts": "1", "adam_gauss_newton.rounds": "1",
     "adam_gauss_newton.newton_steps": "2", "adam_gauss_newton.adam_steps": "3",
@@ -64,7 +67,7 @@ FEW = {
 
 
 def narrow(**settings) -> SecondStage:
-    plain = {"rounds": 2, "steps": 1, "dtype": "float32", "channels_last": False, "compile": False}
+    plain = {"rounds": 2, "steps": 1, "dtype": "float32", "channels_last": False, "compile": False, "cuda_graph": False}
     plain |= {"architecture": "narrow", "starts": [1, 2], "attention": "sdpa", "max_batch": None, **settings}
     return SecondStage(CPU, **plain)
 
@@ -165,7 +168,7 @@ def uncounted(monkeypatch):
 
 def test_the_section_grows_with_every_stretch(monkeypatch, uncounted):
     seconds = iter(np.random.default_rng(0).uniform(1, 2, 100).tolist())
-    monkeypatch.setattr(SecondStage, "run", lambda self, runner, prior: (next(seconds), 0))
+    monkeypatch.setattr(SecondStage, "run", lambda self, runner, prior, steps: (next(seconds), 0))
     sections = list(narrow().measure())
     shares = [section.done for section in sections]
     assert shares == sorted(shares) and shares[-1] == 1
@@ -195,7 +198,7 @@ def test_rounds_alternate_and_the_loop_takes_its_starts_in_turn(monkeypatch, unc
 
 
 def test_seconds_are_those_of_one_step_of_all_starts(monkeypatch, uncounted):
-    monkeypatch.setattr(SecondStage, "run", lambda self, runner, prior: (3.0 * self.steps, 1000))
+    monkeypatch.setattr(SecondStage, "run", lambda self, runner, prior, steps: (3.0 * steps, 1000))
     *_, last = narrow(steps=4).measure()
     seconds = {figure.label: (figure.first, figure.second) for figure in last.figures}
     assert seconds["2 starts, seconds a step"] == (3, 6)
@@ -262,6 +265,17 @@ def test_operations_are_those_of_matrix_products_and_convolutions():
     assert counted(lambda: (left @ right).sum().backward()) == 2 * 2 * 3 * 4 * 5  # and the gradient of the left alone
     image, kernel = torch.zeros(2, 3, 8, 8, device="meta"), torch.zeros(6, 3, 3, 3, device="meta")
     assert counted(lambda: torch.nn.functional.conv2d(image, kernel, padding=1)) == 2 * 2 * 8 * 8 * 6 * 3 * 9
+
+
+def test_launches_are_what_computes():
+    matrix = torch.rand(4, 4)
+    assert launched(lambda: torch.empty(4, 4).copy_(matrix.t()[1:].reshape(12).sum() + matrix.view(2, 8)[0, 0])) == 4
+
+
+def test_a_batched_step_has_as_many_launches_from_few_starts_as_from_many(priors, pairs):
+    energy = PairEnergy(priors[0], pairs, seed=0)
+    two, four = (launched(Batched(energy, Ring(count).make(pairs.ids, seed=0)).step) for count in (2, 4))
+    assert two == four > 300
 
 
 def test_a_step_has_as_many_operations_as_starts():
@@ -334,7 +348,7 @@ def test_a_gpus_memory_is_what_its_allocator_says(monkeypatch):
     assert peak_bytes(allocator.step, gpu) == 30
     allocator.most = 5000
     prior = torch.nn.Linear(3, 2)
-    seconds, peak = dataclasses.replace(narrow(), device=gpu).run(allocator, prior)
+    seconds, peak = dataclasses.replace(narrow(), device=gpu).run(allocator, prior, steps=1)
     assert peak == 30 + 4 * (6 + 2) and seconds >= 0
 
 
@@ -461,6 +475,25 @@ def test_the_original_layout_is_the_published_one(tmp_path):
         assert key.startswith("model_ema.") or torch.equal(tensor, wanted[key])
 
 
+# ---------------------------------------------------------------- a pair, growth, precision
+
+
+def test_a_pair_is_encoded_once_here_and_at_every_step_of_the_loop(priors, monkeypatch):
+    monkeypatch.setattr(SecondStage, "priors", lambda stage: priors)
+    with Passes(priors[0]) as ours, Passes(priors[1]) as loop:
+        *_, last = whole_pair.measure(narrow(), load_model(SHIPPED / "score"), [2], steps=3, rounds=1)
+    assert ours == {"vae": [2] * 2, "clip": [2] * 2, "unet": [4] * 2 * 3}  # the first pair, and one more
+    steps = 1 + 2 * 3  # to warm up, and of either start
+    assert loop == {"vae": [2] * 2 * steps, "clip": [2] * steps, "unet": [2] * steps}
+    assert [figure.label for figure in last.figures] == ["2 starts, seconds a pair"] and last.done == 1
+
+
+def test_the_papers_seconds_stand_beside_those_of_the_same_work():
+    measured = {"2": {BATCHED: {"median": 1.286}, LOOP: {"median": 9.0}}, "3": {BATCHED: {"median": 1.0}}}
+    section = Section("pair", (BATCHED, LOOP), [], measured, 1.0)
+    assert whole_pair.beside(section) == "The paper's on an RTX 6000 Ada: 12.86 s from 2 (here 0.1 of that)"
+
+
 # ---------------------------------------------------------------- growth, precision
 
 
@@ -490,6 +523,7 @@ def test_sizes_that_give_no_exponent(settings, words):
         ("bfloat16", Variant("bfloat16")),
         ("channels_last", Variant(channels_last=True)),
         ("compile float16 channels_last", Variant("float16", True, True)),
+        ("cuda_graph bfloat16", Variant("bfloat16", recorded=True)),
     ],
 )
 def test_variants_by_name(words, variant):
@@ -538,10 +572,10 @@ def test_the_command_measures_what_is_named(lp, tmp_path):
 def test_a_run_that_is_stopped_keeps_what_it_has(lp, tmp_path, monkeypatch):
     run = SecondStage.run
 
-    def stopped(self, runner, prior):
+    def stopped(self, runner, prior, steps):
         if isinstance(runner, Batched) and runner.poses.shape[1] == 2:
             raise KeyboardInterrupt
-        return run(self, runner, prior)
+        return run(self, runner, prior, steps)
 
     monkeypatch.setattr(SecondStage, "run", stopped)
     assert lp("bench", *overrides(), "hydra.run.dir=run").status == 130
@@ -578,6 +612,7 @@ def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
             assert entry["ratio"] == pytest.approx(one / other)
     assert list(kept["encoding"]) == ["backbone", "prior", "frozen_training"]
     assert list(kept["first_stage"]) == ["1_pairs", "2_pairs"] and "raycast" in kept["rendering"]
+    assert list(kept["pair"]) == ["1", "2", "first_pair_seconds"] and "of that" not in ran.out  # 2 steps are not 50
     assert list(kept["checkpoint"]) == ["float32", "bfloat16"]
     assert kept["checkpoint"]["bfloat16"]["gigabytes"]["converted folder"] < 0.01
     for entry in kept["adam_gauss_newton"].values():
@@ -611,6 +646,7 @@ def test_the_table_gives_ratios_of_the_first_to_the_second():
         ("second_stage.dtype=float64", "second_stage.dtype=float64 is none of its values; did you mean 'float16'?"),
         ("second_stage.attention=fused", "second_stage.attention=fused is none of its values (known: sdpa, math)"),
         ("second_stage.starts=[2,0]", "second_stage.starts must list numbers of starts, at least 1 each, got [2, 0]"),
+        ("measure=[pair] pair.starts=[]", "pair.starts must list numbers of starts, at least 1 each, got []"),
         ("second_stage.starts=4", "second_stage.starts must list numbers of starts, at least 1 each, got 4"),
         ("measure=[first_stage] first_stage.views=1", "first_stage.views must be at least 2, got 1"),
         (

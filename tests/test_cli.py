@@ -107,6 +107,15 @@ def test_an_experiment_of_another_command_says_whose_it_is(lp, write):
     assert finished.error.endswith("; it goes with eval or estimate or landscape")
 
 
+@pytest.mark.parametrize("command", ["train", "eval"])
+def test_so_does_one_that_only_sets_what_another_command_has(lp, command):
+    """`train` has a backbone without the setting, `eval` none at all."""
+    finished = lp(command, "experiment=gpu")
+    assert finished.status == 2
+    assert finished.error.startswith(f"experiment=gpu: is none of {command}'s (known: ")
+    assert finished.error.endswith("; it goes with bench")
+
+
 def test_a_yaml_may_choose_a_member_of_another_group(lp, walker, write):
     write("configs/solver/walk.yaml", "defaults: [{/model@_global_.second: net}]\nsteps: 9\n")
     config = config_of(lp(*DEMO, "--cfg", "job"))

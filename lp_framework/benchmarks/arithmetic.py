@@ -1,12 +1,13 @@
-"""Floating-point operations: how many a piece of work needs, and how many a device can do."""
+"""Floating-point operations: how many a piece of work needs, in how many launches, and how many a device can do."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from lp_framework.clock import now
@@ -37,10 +38,11 @@ class Peak(NamedTuple):
 
 
 class Arithmetic(NamedTuple):
-    """The operations of a piece of work, and what the device could do."""
+    """The operations of a piece of work, what the device could do, and the launches where they were counted."""
 
     operations: int
     peak: Peak
+    launches: int | None = None
 
     def share(self, seconds: float) -> float:
         """The share of the device's peak that is reached when the work takes so long."""
@@ -50,13 +52,15 @@ class Arithmetic(NamedTuple):
         """For the JSON file."""
         return {
             "operations": self.operations,
+            **({} if self.launches is None else {"launches": self.launches}),
             "peak_operations_per_second": self.peak.rate,
             "peak_source": self.peak.source,
         }
 
     def __str__(self) -> str:
         rate = f"{self.peak.rate / 1e12:.3g} TFLOP/s ({self.peak.source})"
-        return f"{self.operations / 1e9:.3g} GFLOP, the device's peak {rate}"
+        launches = "" if self.launches is None else f" in {self.launches:,} launches"
+        return f"{self.operations / 1e9:.3g} GFLOP{launches}, the device's peak {rate}"
 
 
 def counted(work: Callable[[], object]) -> int:
@@ -67,6 +71,30 @@ def counted(work: Callable[[], object]) -> int:
     with FlopCounterMode(display=False) as counter:
         work()
     return int(counter.get_total_flops())
+
+
+def launched(work: Callable[[], object]) -> int:
+    """Operators in a piece of work that compute something, each at least one launch of a kernel on a GPU.
+
+    Views and memory that is only taken do not count; on the meta device nothing is computed, as for `counted`.
+    """
+    with _Launches() as launches:
+        work()
+    return launches.count
+
+
+class _Launches(TorchDispatchMode):
+    FREE = ("aten::_unsafe_view", "aten::empty", "aten::new_empty")  # and what begins so
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(
+        self, function: Any, types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        self.count += not (function.is_view or function.name().startswith(self.FREE))
+        return function(*args, **(kwargs or {}))
 
 
 def peak(device: torch.device, dtype: torch.dtype) -> Peak:

@@ -33,11 +33,12 @@ def compete(
     rounds: int,
     device: torch.device,
     note: str = "",
+    warm_up: bool = True,
 ) -> Iterator[Section]:
-    """The section after every stretch: one warm-up of each work, then `rounds` of all of them in turn."""
+    """The section after every stretch: each work once to warm up, then `rounds` of all of them in turn."""
     works = {match.key: dict(zip(contenders, (match.first, match.second), strict=True)) for match in matches}
     values: dict[str, dict[str, list[float]]] = {key: {name: [] for name in contenders} for key in works}
-    for both in works.values():
+    for both in works.values() if warm_up else ():
         for work in both.values():
             work()
     stretch, stretches = 0, 2 * rounds * len(matches)

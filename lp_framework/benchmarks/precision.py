@@ -22,7 +22,7 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
 
 VARIANT, PLAIN = "as named", "plain float32"
-LAYOUT, COMPILED = "channels_last", "compile"
+LAYOUT, COMPILED, RECORDED = "channels_last", "compile", "cuda_graph"
 
 
 class Variant(NamedTuple):
@@ -31,18 +31,19 @@ class Variant(NamedTuple):
     dtype: str = "float32"
     channels_last: bool = False
     compiled: bool = False
+    recorded: bool = False
 
     @staticmethod
     def named(words: str) -> Variant:
         """Of words such as "bfloat16 channels_last compile", in any order; the dtype is float32 where none is named."""
         chosen = words.split()
         dtypes = [word for word in chosen if word in DTYPES]
-        known = [*DTYPES, LAYOUT, COMPILED]
+        known = [*DTYPES, LAYOUT, COMPILED, RECORDED]
         if not chosen or len(dtypes) > 1 or len({*chosen}) < len(chosen) or not {*chosen} <= {*known}:
             raise UserError(
                 f"precision.variants: '{words}' is none; give one or more of {', '.join(known)}, with one dtype at most"
             )
-        return Variant(dtypes[0] if dtypes else "float32", LAYOUT in chosen, COMPILED in chosen)
+        return Variant(dtypes[0] if dtypes else "float32", *(word in chosen for word in (LAYOUT, COMPILED, RECORDED)))
 
 
 @dataclass(frozen=True)
@@ -69,21 +70,18 @@ class Precision:
         starts = Ring(self.starts).make(pair.ids, seed=0)
         runners = {words: Batched(PairEnergy(prior, pair, 0, codes), starts) for words, prior in priors.items()}
         runners[PLAIN] = Batched(PairEnergy(plain, pair, 0, codes), starts)
+        memory: dict[str, int] = {}
         with torch.backends.cudnn.flags(allow_tf32=False):  # in which a GPU convolves float32 otherwise
-            exact = gradient(runners[PLAIN])
-        off = {words: deviation(gradient(runners[words]), exact) for words in variants}
+            exact = self.first_gradient(PLAIN, runners[PLAIN], plain, memory)
+        off = {
+            words: deviation(self.first_gradient(words, runners[words], priors[words], memory), exact)
+            for words in variants
+        }
         operations = self.operations()
         arithmetic = {
             words: Arithmetic(operations, peak(self.device, DTYPES[variant.dtype]))
             for words, variant in {PLAIN: Variant(), **variants}.items()
         }
-        memory: dict[str, int] = {}
-        if self.device.type == "cuda":
-            memory = {
-                words: peak_bytes(runner.step, self.device)
-                + sum(each.nbytes for each in (plain if words == PLAIN else priors[words]).unet.parameters())
-                for words, runner in runners.items()
-            }
         matches = [
             Match(words, f"{words}: seconds a step", self.work(runners[words]), self.work(runners[PLAIN]), rate=False)
             for words in variants
@@ -112,12 +110,23 @@ class Precision:
                     record[words]["peak_bytes"] = {name: memory[each] for name, each in both.items()}
             yield replace(section, figures=figures, record=record)
 
+    def first_gradient(self, words: str, runner: Batched, prior: Zero123Prior, memory: dict[str, int]) -> torch.Tensor:
+        """The gradient before the first step, and on a GPU the memory of it: later a recorded step takes no more."""
+        found: list[torch.Tensor] = []
+        if self.device.type == "cuda":
+            memory[words] = peak_bytes(lambda: found.append(gradient(runner)), self.device)
+            memory[words] += sum(each.nbytes for each in prior.unet.parameters())
+        else:
+            found.append(gradient(runner))
+        return found[0]
+
     def prior(self, networks: Networks, variant: Variant) -> Zero123Prior:
         """With a U-Net of its own."""
         others = {id(each): each for each in (networks.vae, networks.image_encoder)}
         own = copy.deepcopy(networks, others)
         nn.Module.to(own.unet, DTYPES[variant.dtype])  # diffusers' own `to` warns of nothing
-        return Zero123Prior(own, variant.channels_last, variant.compiled, max_batch=self.max_batch).to(self.device)
+        settings = variant.channels_last, variant.compiled, variant.recorded
+        return Zero123Prior(own, *settings, max_batch=self.max_batch).to(self.device)
 
     def operations(self) -> int:
         """Of a step, counted on the meta device: nothing is computed."""

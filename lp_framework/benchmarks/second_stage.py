@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from lp_framework.benchmarks.arithmetic import Arithmetic, counted, peak
+from lp_framework.benchmarks.arithmetic import Arithmetic, counted, launched, peak
 from lp_framework.benchmarks.section import Figure, Section
 from lp_framework.clock import now
 from lp_framework.errors import UserError
@@ -50,6 +50,13 @@ def random_pair(device: torch.device) -> Pairs:
     """A pair of random images of Zero123's size."""
     index = torch.arange(2, device=device)
     return Pairs(torch.rand(2, 3, IMAGE_SIZE, IMAGE_SIZE, device=device) * 2 - 1, index[:1], index[1:], ids=index[:1])
+
+
+def check_counts(name: str, starts: Sequence[int]) -> None:
+    """`UserError` unless they are numbers of starts."""
+    listed = isinstance(starts, Sequence) and all(isinstance(each, int) and each > 0 for each in starts)
+    if not listed or not starts:
+        raise UserError(f"{name} must list numbers of starts, at least 1 each, got {starts}")
 
 
 class Batched:
@@ -133,13 +140,12 @@ class SecondStage:
     dtype: Dtype
     channels_last: bool
     compile: bool
+    cuda_graph: bool
     attention: Attention
     max_batch: int | None
 
     def __post_init__(self) -> None:
-        listed = isinstance(self.starts, Sequence) and all(isinstance(each, int) and each > 0 for each in self.starts)
-        if not listed or not self.starts:
-            raise UserError(f"second_stage.starts must list numbers of starts, at least 1 each, got {self.starts}")
+        check_counts("second_stage.starts", self.starts)
         if self.max_batch is not None and self.max_batch < 1:
             raise UserError(f"second_stage.max_batch must be at least 1 or null, got {self.max_batch}")
 
@@ -154,8 +160,11 @@ class SecondStage:
         ring = {count: Ring(count).make(pair.ids, seed=0) for count in self.starts}
         batched = {count: Batched(energy, starts) for count, starts in ring.items()}
         loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(self.starts)][0]]
-        self.warm_up(batched, loops[0])
         measured = {count: {BATCHED: Measured(), LOOP: Measured()} for count in self.starts}
+        for count in self.sizes():
+            # A step that is recorded takes its memory now.
+            _, measured[count][BATCHED].peak = self.run(batched[count], batch_prior, steps=1)
+        loops[0].step()
         done, total = 0, 2 * self.rounds * sum(self.starts)
         for _ in range(self.rounds):
             for count in self.starts:
@@ -164,7 +173,7 @@ class SecondStage:
                 for name, (runners, prior) in contenders.items():
                     seconds = 0.0
                     for runner in runners:
-                        stretch, peak = self.run(runner, prior)
+                        stretch, peak = self.run(runner, prior, self.steps)
                         seconds += stretch / self.steps
                         measured[count][name].peak = max(measured[count][name].peak, peak)
                         done += count // len(runners)
@@ -181,9 +190,11 @@ class SecondStage:
         loop = PlainLoop(loop_prior, pair.images, torch.zeros(3))
         pose = torch.zeros(3, device=meta.device, requires_grad=True)
         noise = torch.empty(2, *loop_prior.latent_shape, device=meta.device)
+        steps: dict[str, tuple[Callable[[], None], Dtype]]
+        steps = {BATCHED: (batched.step, self.dtype), LOOP: (lambda: loop.loss(pose, noise).backward(), "float32")}
         return {
-            BATCHED: Arithmetic(counted(batched.step), peak(self.device, DTYPES[self.dtype])),
-            LOOP: Arithmetic(counted(lambda: loop.loss(pose, noise).backward()), peak(self.device, torch.float32)),
+            name: Arithmetic(counted(step), peak(self.device, DTYPES[dtype]), launched(step))
+            for name, (step, dtype) in steps.items()
         }
 
     def priors(self) -> tuple[Zero123Prior, Zero123Prior]:
@@ -197,24 +208,23 @@ class SecondStage:
         loop = Zero123Prior(copy.deepcopy(networks, shared)).to(self.device)
         loop.unet.set_attn_processor(AttnProcessor())  # softmax(Q K^T / sqrt(d)) V, step by step
         networks.to(DTYPES[self.dtype])
-        batch = Zero123Prior(networks, self.channels_last, self.compile, self.attention, self.max_batch)
+        batch = Zero123Prior(
+            networks, self.channels_last, self.compile, self.cuda_graph, self.attention, self.max_batch
+        )
         return batch.to(self.device), loop
 
-    def warm_up(self, batched: Mapping[int, Batched], loop: PlainLoop) -> None:
-        """A step of each; on a GPU, and compiled, of each number of starts: the first of a size prepares it."""
-        sizes = self.starts if self.device.type == "cuda" or self.compile else [min(self.starts)]
-        for count in sizes:
-            batched[count].step()
-        loop.step()
+    def sizes(self) -> Sequence[int]:
+        """The numbers of starts to warm up with: on a GPU, and compiled, all, as the first of a size prepares it."""
+        return self.starts if self.device.type == "cuda" or self.compile else [min(self.starts)]
 
-    def run(self, runner: Batched | PlainLoop, prior: Zero123Prior) -> tuple[float, int]:
-        """Seconds of `steps` steps, and on a GPU the peak of memory in bytes: this contender's weights and its work."""
+    def run(self, runner: Batched | PlainLoop, prior: Zero123Prior, steps: int) -> tuple[float, int]:
+        """Seconds of some steps, and on a GPU the peak of memory in bytes: this contender's weights and its work."""
         cuda = self.device.type == "cuda"
         began = now(self.device)
         if cuda:
             torch.cuda.reset_peak_memory_stats(self.device)
             before = torch.cuda.memory_allocated(self.device)
-        for _ in range(self.steps):
+        for _ in range(steps):
             runner.step()
         seconds = now(self.device) - began
         if not cuda:

@@ -21,6 +21,7 @@ from lp_framework.benchmarks import (
     encoding,
     first_stage,
     loader,
+    pair,
     precision,
     rendering,
     scaling,
@@ -101,11 +102,20 @@ def _first_stage(config: DictConfig, device: torch.device) -> Iterator[Section]:
 
 
 def _second_stage(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    return _stage(config, device).measure()
+
+
+def _pair(config: DictConfig, device: torch.device) -> Iterator[Section]:
+    settings = _settings(config, "pair", "steps", "rounds")
+    return pair.measure(_stage(config, device), _pose_model(), **settings)
+
+
+def _stage(config: DictConfig, device: torch.device) -> second_stage.SecondStage:
     settings = _settings(config, "second_stage", "rounds", "steps")
     for key, kind in (("architecture", second_stage.Architecture), ("dtype", Dtype), ("attention", Attention)):
         _check_choice(f"second_stage.{key}", settings[key], typing.get_args(kind))
     require_packages()
-    return second_stage.SecondStage(device, **settings).measure()
+    return second_stage.SecondStage(device, **settings)
 
 
 def _precision(config: DictConfig, device: torch.device) -> Iterator[Section]:
@@ -159,6 +169,7 @@ MEASUREMENTS: dict[str, Callable[[DictConfig, torch.device], Iterator[Section]]]
     "encoding": _encoding,
     "first_stage": _first_stage,
     "second_stage": _second_stage,
+    "pair": _pair,
     "precision": _precision,
     "adam_gauss_newton": _adam_gauss_newton,
     "rendering": _rendering,

@@ -70,9 +70,6 @@ class Chunks:
         return max(counts)
 
 
-STEEPER = 4096  # times the energy is differentiated, lest small slopes vanish in float16; a power of two is exact
-
-
 class EnergyAndSlope(torch.autograd.Function):
     """Energies `[B]` of poses `[B, 3]` whose gradient is computed at once, chunk by chunk.
 
@@ -81,16 +78,8 @@ class EnergyAndSlope(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(pose: Tensor, energy: Callable[[slice, Tensor], Tensor], chunks: Chunks) -> tuple[Tensor, Tensor]:
-        """Energies and their gradients."""
-
-        def both(part: slice) -> tuple[Tensor, Tensor]:
-            with torch.enable_grad():
-                poses = pose[part].detach().requires_grad_()
-                energies = energy(part, poses)
-                (slope,) = torch.autograd.grad(STEEPER * energies.sum(), poses)
-            return energies.detach(), slope / STEEPER
-
+    def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
+        """Energies and their gradients, which `both` computes of a chunk."""
         energies, slopes = zip(*chunks.run(both, len(pose)), strict=True)
         return torch.cat(energies), torch.cat(slopes)
 

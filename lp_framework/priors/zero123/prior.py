@@ -15,12 +15,14 @@ from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, 
 from lp_framework.priors.zero123.attention import Attention, choose_attention
 from lp_framework.priors.zero123.chunks import Chunks, EnergyAndSlope
 from lp_framework.priors.zero123.conditioning import conditioning_vector
+from lp_framework.priors.zero123.cuda_graph import Replayed
 from lp_framework.priors.zero123.networks import Dtype, Networks
 from lp_framework.priors.zero123.original import Averages
 from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.registry import register
 
 IMAGE_SIZE = 256  # the sizes in the configs of published folders are those of Stable Diffusion, some of them
+STEEPER = 4096  # times the energy is differentiated, lest small slopes vanish in float16; a power of two is exact
 SCALE = 0.18215  # of latents before noise is added; the latent of the source is not scaled
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
@@ -32,6 +34,8 @@ class Zero123Prior(Prior):
     Poses, their projection and energies are float32 in any case.
 
     - `channels_last`, `compile`: memory layout of the U-Net, and `torch.compile` of it (slow at the first call).
+    - `cuda_graph`: on a GPU, the energy and its gradient are recorded once for each size of a batch and then replayed,
+      which spares the host a thousand launches a step; worth it for few starts, on which a GPU waits for the host.
     - `attention`: `sdpa` is PyTorch's fused attention, `math` its plain one, which can be differentiated twice.
     - `max_batch`: samples that pass a network at once; more are split. On a GPU that runs out of memory it is halved.
     """
@@ -45,6 +49,7 @@ class Zero123Prior(Prior):
         networks: Networks,
         channels_last: bool = False,
         compile: bool = False,
+        cuda_graph: bool = False,
         attention: Attention = "sdpa",
         max_batch: int | None = None,
     ) -> None:
@@ -64,18 +69,26 @@ class Zero123Prior(Prior):
         side = IMAGE_SIZE // 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size, self.latent_shape = IMAGE_SIZE, (int(self.vae.config.latent_channels), side, side)
         self.channels_last, self.chunks = channels_last, Chunks(max_batch)
+        self.replayed = Replayed(self._energy_and_slope) if cuda_graph else None
         alphas = scaled_linear_alphas()
         self.num_timesteps = len(alphas)
         self.register_buffer("alphas_cumprod", alphas, persistent=False)
         self.register_buffer("clip_mean", torch.tensor(CLIP_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("clip_std", torch.tensor(CLIP_STD).view(3, 1, 1), persistent=False)
 
+    def _apply(self, function: Any, recurse: bool = True) -> Any:
+        """Whatever moves or converts a module passes here."""
+        if self.replayed is not None:
+            self.replayed.forget()
+        return super()._apply(function, recurse)
+
     def shard(self, mesh: DeviceMesh) -> None:
         """See `Prior.shard`: PyTorch's FSDP, block by block; a block's weights are gathered while it computes."""
         from torch.distributed.fsdp import fully_shard  # not in every build of PyTorch
 
-        if self.channels_last:
-            raise UserError("prior.channels_last=true and trainer.strategy=model_parallel do not go together")
+        for setting, chosen in (("channels_last", self.channels_last), ("cuda_graph", self.replayed)):
+            if chosen:
+                raise UserError(f"prior.{setting}=true and trainer.strategy=model_parallel do not go together")
         unet, encoder = self.unet, self.image_encoder.vision_model.encoder
         for block in (*unet.down_blocks, unet.mid_block, *unet.up_blocks, *encoder.layers):
             fully_shard(block, mesh=mesh)
@@ -147,14 +160,27 @@ class Zero123Prior(Prior):
         """See `Prior.denoising_error`. A chunk's gradient is taken with its value, so memory is that of one chunk."""
         self.check(target, source, pose, timestep, noise)
 
-        def energy(part: slice, poses: Tensor) -> Tensor:
-            residual = self._residual(target[part], source[part], poses, timestep[part], noise[part])
-            return residual.square().flatten(1).mean(dim=1)
-
+        inputs = pose, target.latent, source.latent, source.embedding, timestep, noise
         if pose.requires_grad and torch.is_grad_enabled():
-            energies, _ = EnergyAndSlope.apply(pose, energy, self.chunks)
+            both = self.replayed or self._energy_and_slope
+            energies, _ = EnergyAndSlope.apply(pose, lambda part: both(*(each[part] for each in inputs)), self.chunks)
             return energies
-        return torch.cat(self.chunks.run(lambda part: energy(part, pose[part]), len(pose)))
+        return torch.cat(self.chunks.run(lambda part: self._energy(*(each[part] for each in inputs)), len(pose)))
+
+    def _energy(
+        self, pose: Tensor, target: Tensor, source: Tensor, embedding: Tensor, timestep: Tensor, noise: Tensor
+    ) -> Tensor:
+        """Of a chunk, of the targets' and the sources' latents."""
+        codes = ViewCode(target, embedding), ViewCode(source, embedding)  # a target's embedding is not read
+        return self._residual(*codes, pose, timestep, noise).square().flatten(1).mean(dim=1)
+
+    def _energy_and_slope(self, pose: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and its gradient in the poses."""
+        with torch.enable_grad():
+            pose = pose.detach().requires_grad_()
+            energies = self._energy(pose, *others)
+            (slope,) = torch.autograd.grad(STEEPER * energies.sum(), pose)
+        return energies.detach(), slope / STEEPER
 
     # ------------------------------------------------------------ novel views
 
@@ -214,37 +240,30 @@ class Zero123Prior(Prior):
 class Zero123(Zero123Prior):
     """Zero123: `path` is its checkpoint (105000.ckpt), a folder in diffusers' layout, or a Hugging Face id.
 
-    `weights` chooses the moving averages (as iFusion) or the raw weights (as ID-Pose) of a checkpoint file.
+    Without a `path` it is `PUBLISHED`. `weights` chooses the moving averages (as iFusion) or the raw weights (as
+    ID-Pose) of a checkpoint file.
     """
+
+    PUBLISHED = "kxic/zero123-105000"  # a Hugging Face id
 
     def __init__(
         self,
-        path: str = "kxic/zero123-105000",
+        path: str | None = None,
         revision: str | None = None,
         weights: Averages = "ema",
         dtype: Dtype = "float32",
         channels_last: bool = False,
         compile: bool = False,
+        cuda_graph: bool = False,
         attention: Attention = "sdpa",
         max_batch: int | None = None,
     ) -> None:
-        networks = load_networks(path, revision, weights, dtype)
-        super().__init__(networks, channels_last, compile, attention, max_batch)
+        networks = load_networks(self.PUBLISHED if path is None else path, revision, weights, dtype)
+        super().__init__(networks, channels_last, compile, cuda_graph, attention, max_batch)
 
 
 @register("prior", "zero123xl")
 class Zero123XL(Zero123):
     """Zero123-XL, trained on Objaverse-XL: as `zero123`; its checkpoint is zero123-xl.ckpt."""
 
-    def __init__(
-        self,
-        path: str = "kxic/zero123-xl",
-        revision: str | None = None,
-        weights: Averages = "ema",
-        dtype: Dtype = "float32",
-        channels_last: bool = False,
-        compile: bool = False,
-        attention: Attention = "sdpa",
-        max_batch: int | None = None,
-    ) -> None:
-        super().__init__(path, revision, weights, dtype, channels_last, compile, attention, max_batch)
+    PUBLISHED = "kxic/zero123-xl"
