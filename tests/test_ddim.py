@@ -35,7 +35,7 @@ def test_gaussian_data_keeps_its_spread(eta):
         return (1 - alpha).sqrt() * (latent - alpha.sqrt() * mean) / (alpha * spread**2 + 1 - alpha)
 
     first = ALPHAS[ddim_timesteps(200)[0]]  # where the data is not quite standard normal noise yet
-    draw = torch.randn(20_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    draw = torch.randn(1, 20_000, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     start = first.sqrt() * mean + (first * spread**2 + 1 - first).sqrt() * draw
     found = ddim_sample(noise_in, start, ALPHAS, 200, eta, torch.Generator().manual_seed(1))
     assert found.mean().item() == pytest.approx(mean, abs=0.02)

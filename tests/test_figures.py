@@ -17,6 +17,7 @@ from result_folders import metrics, write_result
 from tiny_runs import Commands
 from view_folders import write_objects
 
+from lp_framework import load_prior
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.sources import MeshData, RenderingsData
 from lp_framework.errors import UserError
@@ -144,16 +145,17 @@ def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
         np.testing.assert_allclose(generated, np.clip(pose.numpy() + path[contents.steps], -1, 1), atol=1e-5)
 
 
-def test_generated_views_share_their_draws():
-    class Noisy(ExactPrior):
-        def generate(self, source, pose, steps=50, guidance=3.0, generator=None, eta=1.0):
-            noise = torch.rand(len(pose), 3, 8, 8, generator=generator)
-            return noise + pose[:, 1, None, None, None]
-
-    prior = Noisy()
-    poses = torch.tensor([[0.0, 0.0, 0.0], [0.0, -0.5, 0.0]])
-    views = generated_views(prior, prior.encode(PAIRS.images[:1]), poses, 5, 1.0, seed=4)
-    np.testing.assert_allclose(views[0] - views[1], 0.25, atol=1e-6)
+def test_generated_views_differ_by_their_poses_alone(monkeypatch):
+    """Whatever comes along with them."""
+    prior = load_prior("tiny")
+    source = prior.encode(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)) * 2 - 1)
+    poses = torch.tensor([[0.0, 0.5, 0.0], [0.2, 3.0, 0.0], [0.0, 0.5, 0.0]])
+    together = generated_views(prior, source, poses, 5, 1.0, seed=4)
+    assert together.shape == (3, 64, 64, 3)
+    np.testing.assert_allclose(together[0], together[2], atol=1e-6)
+    assert np.abs(together[0] - together[1]).max() > 0.01
+    monkeypatch.setattr("lp_framework.figures.generated.AT_ONCE", 2)
+    np.testing.assert_allclose(generated_views(prior, source, poses, 5, 1.0, seed=4), together, atol=1e-5)
 
 
 # ---------------------------------------------------------------- cameras

@@ -248,12 +248,14 @@ def test_the_gradient_keeps_the_memory_of_one_chunk(prior, problem):
 def test_generated_views_repeat_with_the_generator(prior, problem):
     _, source, pose, _, _ = problem
 
-    def views(seed, **settings):
-        return prior.generate(source[:2], pose[:2], steps=3, generator=torch.Generator().manual_seed(seed), **settings)
+    def views(seed, order=(0, 1), **settings):
+        generator = torch.Generator().manual_seed(seed)
+        return prior.generate(source[torch.tensor(order)], pose[list(order)], 3, generator=generator, **settings)
 
     first = views(0)
     assert first.shape == (2, 3, 64, 64) and first.abs().max() <= 1
     assert torch.equal(first, views(0)) and not torch.equal(first, views(1))
+    close(views(0, order=(2, 1, 0))[1:], first.flip(0), 1e-3)  # whatever is generated beside it
     assert not torch.equal(first, views(0, eta=0.0)) and not torch.equal(first, views(0, guidance=1.0))
     prior.chunks.size = 1
     try:

@@ -52,10 +52,10 @@ def run(config: DictConfig) -> None:
 
     poses = grid(latitudes, longitudes)  # [rows, columns, 3]
     code = prior.encode(image_batch([source.image]).to(device))
-    generator = torch.Generator().manual_seed(config.seed)  # on the CPU: a GPU gets the same draws
     columns = []
     for column in tracked(range(len(longitudes)), "views around the object"):
         pose = poses[:, column].to(device)
+        generator = torch.Generator().manual_seed(config.seed)  # all views' draws; on the CPU: a GPU gets the same
         repeated = code[torch.zeros(len(pose), dtype=torch.int64, device=device)]
         images = prior.generate(repeated, pose, config.steps, config.guidance, generator, config.eta)
         columns.append(pixels(images))

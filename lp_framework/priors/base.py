@@ -73,7 +73,8 @@ class Prior(nn.Module, ABC):
     ) -> Tensor:
         """Novel views `[B, 3, image_size, image_size]` in [-1, 1] of `source` under relative poses `[B, 3]`, by DDIM.
 
-        `guidance` is the scale of classifier-free guidance (1: none), `eta` the share of fresh noise (0: none).
+        `guidance` is the scale of classifier-free guidance (1: none), `eta` the share of fresh noise (0: none). All
+        views of a call have the same draws: they differ by source and pose alone.
         """
 
     def shard(self, mesh: DeviceMesh) -> None:

@@ -49,7 +49,10 @@ def ddim_sample(
     eta: float,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """Latents `[B, ...]` from the noise `start`, in `steps`; `predict(latent, timestep)` is epsilon_theta."""
+    """Latents `[B, ...]` from the noise `start`, in `steps`; `predict(latent, timestep)` is epsilon_theta.
+
+    Fresh noise is the same for all of a batch, see `standard_normal`.
+    """
     if not 0 <= eta <= 1:
         raise UserError(f"eta must lie in [0, 1], got {eta}")
     timesteps = ddim_timesteps(steps, len(alphas))
@@ -62,9 +65,12 @@ def ddim_sample(
 
 
 def standard_normal(like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Standard normal noise of the shape, device and dtype of `like`, drawn on the generator's device."""
+    """Standard normal noise of the shape, device and dtype of `like` `[B, ...]`, drawn on the generator's device.
+
+    All of a batch have the same: views then differ by what they are asked for alone, and are the same in any batch.
+    """
     device = generator.device if generator is not None else like.device
-    return torch.randn(like.shape, generator=generator, device=device).to(like)
+    return torch.randn(like.shape[1:], generator=generator, device=device).to(like).expand_as(like)
 
 
 def guided(unconditional: Tensor, conditional: Tensor, guidance: float) -> Tensor:
