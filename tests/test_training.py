@@ -234,6 +234,17 @@ def test_a_resumed_run_keeps_its_settings(commands, score):
     )
 
 
+@pytest.mark.parametrize(("key", "value"), [("loops", None), ("epoch", "three"), ("optimizer_states", {})])
+def test_a_checkpoint_without_its_training_is_not_resumed(commands, score, key, value):
+    folder = shutil.copytree(commands.folder / "score", commands.folder / f"without_{key}")
+    (folder / "checkpoints" / "best.ckpt").unlink()
+    file = folder / "checkpoints" / "last.ckpt"
+    torch.save({**torch.load(file, weights_only=True), key: value}, file)
+    ran = commands.here("onwards", "train", f"resume=without_{key}", "trainer.max_epochs=9")
+    missing = f"holds a model, but no training to go on with ('{key}' is missing or damaged)"
+    assert ran.error == f"without_{key}/checkpoints/last.ckpt: {missing}"
+
+
 def test_the_checkpoint_of_another_model_is_not_resumed(commands, score):
     shutil.copytree(score.folder, commands.folder / "mixed")
     ran = commands.here("energy", "train", "model=energy", "trainer.max_epochs=1")

@@ -47,6 +47,8 @@ from lp_framework.viz.pictures import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
 REPORT = "training.json"
+# Of Lightning's entries in a checkpoint, those without which no training goes on.
+TRAINING_STATE = {"epoch": int, "global_step": int, "loops": dict, "optimizer_states": list, "lr_schedulers": list}
 
 
 @orderly_console()
@@ -98,12 +100,21 @@ def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
     """The last checkpoint of the run in `folder`, or its best where the last one was cut short by the run's end."""
     last, best = folder / FOLDER / LAST, folder / FOLDER / BEST
     try:
-        return last, read_checkpoint(last)
+        return last, _training_state(last)
     except UserError as error:
         if not best.is_file():
             raise
         warnings.warn(f"{error}; going on from {best}", stacklevel=2)
-        return best, read_checkpoint(best)
+        return best, _training_state(best)
+
+
+def _training_state(file: Path) -> dict[str, Any]:
+    """A checkpoint with what Lightning needs to go on, besides the weights."""
+    checkpoint = read_checkpoint(file)
+    for key, kind in TRAINING_STATE.items():
+        if not isinstance(checkpoint.get(key), kind):
+            raise UserError(f"{file}: holds a model, but no training to go on with ('{key}' is missing or damaged)")
+    return checkpoint
 
 
 def is_finished(folder: Path, config: DictConfig, checkpoint: Mapping[str, Any]) -> bool:
