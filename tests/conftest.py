@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import settings
 
 from lp_framework import cli, registry, torchvision_ops
 
 torchvision_ops.install()
+torch.set_num_threads(1)  # as have processes that tests start, with whose numbers these are compared to the last bit
 # The same examples everywhere and always; `--hypothesis-profile=default` looks for new ones.
 settings.register_profile("same", derandomize=True, database=None, deadline=None)
 settings.load_profile("same")

@@ -578,7 +578,8 @@ def test_a_run_that_is_stopped_keeps_what_it_has(lp, tmp_path, monkeypatch):
         return run(self, runner, prior, steps)
 
     monkeypatch.setattr(SecondStage, "run", stopped)
-    assert lp("bench", *overrides(), "hydra.run.dir=run").status == 130
+    ran = lp("bench", *overrides(), "hydra.run.dir=run")
+    assert ran.status == 130 and "1 start, seconds a step" in ran.out and "2 starts" not in ran.out
     kept = json.loads((tmp_path / "run" / "bench.json").read_text())
     assert list(kept["second_stage"]["starts"]) == ["1"] and kept["second_stage"]["starts"]["1"]["ratio"]
 

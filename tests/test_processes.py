@@ -33,12 +33,9 @@ EVALUATION = ("checkpoint=score", "batch_pairs=7", "solver.iterations=5")  # 80 
 def commands(tmp_path_factory) -> Commands:
     commands = Commands(tmp_path_factory.mktemp("processes"), test_views=TEST_VIEWS)
     (commands.folder / "plugins" / "tmp_tiny" / "tmp_tiny_unseen.py").write_text(NO_PICTURES)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # as in the processes, so that numbers are equal to the last bit
     trained = commands.here("score", "train", "trainer.max_epochs=1", "backbone.pause=0.05")
     assert trained.status == 0, trained.err
-    yield commands
-    torch.set_num_threads(threads)
+    return commands
 
 
 # Pictures take most of a run's time.

@@ -26,15 +26,6 @@ BATCH = 7  # 80 pairs are 12 batches, the last one of 3
 EVALUATION = ("checkpoint=score", f"batch_pairs={BATCH}", "solver.iterations=5")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """As processes of tests have, whose numbers are compared with those of this one to the last bit."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """They take most of a run's time."""

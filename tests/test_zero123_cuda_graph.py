@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
@@ -15,6 +17,7 @@ from lp_framework.benchmarks.second_stage import NARROW
 from lp_framework.errors import UserError
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.zero123 import cuda_graph
+from lp_framework.priors.zero123.chunks import Chunks
 from lp_framework.priors.zero123.networks import Networks
 from lp_framework.priors.zero123.prior import Zero123Prior
 
@@ -62,16 +65,17 @@ def pools(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     given: list[Any] = []
 
     @contextmanager
-    def recording(graph: Graph, pool: Any, capture_error_mode: str) -> Iterator[None]:
+    def recording(graph: Graph, pool: Any, stream: Stream, capture_error_mode: str) -> Iterator[None]:
         given.append(pool)
         with graph:
             yield
 
     for name, stand_in in (
         ("CUDAGraph", Graph), ("graph", recording), ("Stream", Stream), ("current_stream", Stream),
-        ("stream", lambda stream: nullcontext()),
+        ("stream", lambda stream: nullcontext()), ("device", lambda device: nullcontext()),
     ):  # fmt: skip
         monkeypatch.setattr(torch.cuda, name, stand_in)
+    monkeypatch.setattr(torch._C, "_cuda_clearCublasWorkspaces", lambda: None, raising=False)
     monkeypatch.setattr(cuda_graph, "can_record", lambda device: True)
     return given
 
@@ -125,6 +129,32 @@ def test_a_prior_that_has_moved_is_recorded_anew(pools):
     fresh = energies_and_slopes(wanted, 2, 0)[0]
     torch.testing.assert_close(energies_and_slopes(graphed, 2, 0)[0], fresh, rtol=1e-5, atol=1e-8)
     assert not torch.allclose(stale, fresh, rtol=1e-3)  # the stand-in does keep addresses, as a GPU does
+
+
+def test_a_prior_that_is_let_go_of_is_gone_at_once_and_a_copy_records_for_itself(pools):
+    """Not when the garbage collector comes by: a GPU that is full does not call it."""
+    graphed = prior_of(cuda_graph=True)
+    energies_and_slopes(graphed, 2, 0)
+    copied = copy.deepcopy(graphed)
+    assert graphed.replayed.recordings and not copied.replayed.recordings
+    unet = weakref.ref(graphed.unet)
+    del graphed
+    assert unet() is None
+
+
+def test_recordings_are_given_back_before_a_batch_is_halved():
+    def fits(part: slice) -> slice:
+        if kept or part.stop - part.start > 3:
+            raise torch.cuda.OutOfMemoryError("out of memory")
+        return part
+
+    kept = ["a recording"]
+    chunks = Chunks(3, release=lambda: bool(kept) and kept.pop() is not None)
+    assert [(part.start, part.stop) for part in chunks.run(fits, 5)] == [(0, 3), (3, 5)]
+    assert chunks.size == 3
+    assert len(chunks.run(fits, 2)) == 1
+    chunks.size = 4
+    assert len(chunks.run(fits, 4)) == 2 and chunks.size == 2
 
 
 def test_without_a_gpu_the_setting_changes_nothing():

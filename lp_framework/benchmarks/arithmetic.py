@@ -18,7 +18,7 @@ PEAKS = (
     (r"H200 NVL|H100 NVL", 835, 418),
     (r"H100 PCIe", 756, 378),
     (r"H100|H200|GH200", 989, 495),
-    (r"A100", 312, 156),
+    (r"\bA100\b", 312, 156),
     (r"L40S", 362, 183),
     (r"\bL4\b", 121, 60),
     (r"RTX 6000 Ada", 364, 182),
@@ -35,6 +35,9 @@ class Peak(NamedTuple):
 
     rate: float
     source: str
+
+    def __str__(self) -> str:
+        return f"{self.rate / 1e12:.3g} TFLOP/s ({self.source})"
 
 
 class Arithmetic(NamedTuple):
@@ -58,9 +61,8 @@ class Arithmetic(NamedTuple):
         }
 
     def __str__(self) -> str:
-        rate = f"{self.peak.rate / 1e12:.3g} TFLOP/s ({self.peak.source})"
         launches = "" if self.launches is None else f" in {self.launches:,} launches"
-        return f"{self.operations / 1e9:.3g} GFLOP{launches}, the device's peak {rate}"
+        return f"{self.operations / 1e9:.3g} GFLOP{launches}, the device's peak {self.peak}"
 
 
 def counted(work: Callable[[], object]) -> int:

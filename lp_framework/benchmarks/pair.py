@@ -6,7 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from lp_framework.benchmarks.contest import Match, Work, compete, timed
-from lp_framework.benchmarks.second_stage import BATCHED, LOOP, PlainLoop, SecondStage, check_counts, random_pair
+from lp_framework.benchmarks.second_stage import (
+    BATCHED,
+    LOOP,
+    PlainLoop,
+    SecondStage,
+    check_counts,
+    halved,
+    random_pair,
+)
 from lp_framework.benchmarks.section import Section
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.solvers.starts import Ring
@@ -60,8 +68,9 @@ def measure(stage: SecondStage, model: PoseModel, starts: Sequence[int], steps: 
     )
     title = "pair: both stages and encoding"
     for section in compete(title, (BATCHED, LOOP), matches, rounds, stage.device, note, warm_up=False):
+        few = halved(batch_prior, stage.max_batch)
         papers = beside(section) if stage.architecture == "published" and steps == PAPER_STEPS else ""
-        yield replace(section, record={**section.record, "first_pair_seconds": first}, note=note + papers)
+        yield replace(section, record={**section.record, "first_pair_seconds": first}, note=note + papers + few)
 
 
 def beside(section: Section) -> str:

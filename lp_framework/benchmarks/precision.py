@@ -13,7 +13,7 @@ from torch import nn
 from lp_framework.benchmarks.arithmetic import Arithmetic, counted, peak
 from lp_framework.benchmarks.contest import Match, Work, compete
 from lp_framework.benchmarks.memory import peak_bytes
-from lp_framework.benchmarks.second_stage import ARCHITECTURES, TIMESTEP, Architecture, Batched, random_pair
+from lp_framework.benchmarks.second_stage import ARCHITECTURES, TIMESTEP, Architecture, Batched, halved, random_pair
 from lp_framework.benchmarks.section import Figure, Section
 from lp_framework.errors import UserError
 from lp_framework.priors.zero123.networks import DTYPES, Networks
@@ -46,6 +46,14 @@ class Variant(NamedTuple):
         return Variant(dtypes[0] if dtypes else "float32", *(word in chosen for word in (LAYOUT, COMPILED, RECORDED)))
 
 
+class Contender(NamedTuple):
+    """A way to compute the step; on a GPU with the bytes that it takes at most, else 0."""
+
+    runner: Batched
+    arithmetic: Arithmetic
+    peak_bytes: int
+
+
 @dataclass(frozen=True)
 class Precision:
     """The measurement: `rounds` of `steps` steps of a pair from `starts` starts, on the same random weights."""
@@ -59,66 +67,68 @@ class Precision:
     max_batch: int | None
 
     def measure(self) -> Iterator[Section]:
-        """The section after every stretch."""
+        """The section after every stretch. One variant after the other, so that no more than two U-Nets are held."""
         variants = {words: Variant.named(words) for words in self.variants}
         with self.device:
             networks = Networks(ARCHITECTURES[self.architecture])
         pair = random_pair(self.device)
-        priors = {words: self.prior(networks, variant) for words, variant in variants.items()}
         plain = Zero123Prior(networks, max_batch=self.max_batch).to(self.device)
         codes = plain.encode(pair.images)
         starts = Ring(self.starts).make(pair.ids, seed=0)
-        runners = {words: Batched(PairEnergy(prior, pair, 0, codes), starts) for words, prior in priors.items()}
-        runners[PLAIN] = Batched(PairEnergy(plain, pair, 0, codes), starts)
-        memory: dict[str, int] = {}
-        with torch.backends.cudnn.flags(allow_tf32=False):  # in which a GPU convolves float32 otherwise
-            exact = self.first_gradient(PLAIN, runners[PLAIN], plain, memory)
-        off = {
-            words: deviation(self.first_gradient(words, runners[words], priors[words], memory), exact)
-            for words in variants
-        }
+        runner = Batched(PairEnergy(plain, pair, 0, codes), starts)
+        memory = self.memory(runner, plain)
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
+            exact = gradient(runner)
         operations = self.operations()
-        arithmetic = {
-            words: Arithmetic(operations, peak(self.device, DTYPES[variant.dtype]))
-            for words, variant in {PLAIN: Variant(), **variants}.items()
-        }
-        matches = [
-            Match(words, f"{words}: seconds a step", self.work(runners[words]), self.work(runners[PLAIN]), rate=False)
-            for words in variants
-        ]
-        note = f"Zero123's {self.architecture} size, random weights, {self.starts} starts. " + "; ".join(
-            f"{words}: a step is {arithmetic[words]}, gradient off by {off[words]:.1g}" for words in variants
-        )
-        title = "precision: a step of one pair"
-        for section in compete(title, (VARIANT, PLAIN), matches, self.rounds, self.device, note):
-            figures: list[Figure] = []
-            record: dict[str, Any] = {}
-            for seconds in section.figures:
-                words = seconds.label.partition(":")[0]
-                both = {VARIANT: words, PLAIN: PLAIN}
-                figures.append(seconds)
-                record[words] = {
-                    "seconds_per_step": section.record[words],
-                    "arithmetic": {name: arithmetic[each].record() for name, each in both.items()},
-                    "gradient_deviation": off[words],
-                }
-                shares = arithmetic[words].share(seconds.first), arithmetic[PLAIN].share(seconds.second)
+        ours = Contender(runner, Arithmetic(operations, peak(self.device, torch.float32)), memory)
+        title, note = "precision: a step of one pair", f"Zero123's {self.architecture} size, random weights, "
+        note += f"{self.starts} starts, a step is {operations / 1e9:.3g} GFLOP"
+        figures: list[Figure] = []
+        record: dict[str, Any] = {}
+        for number, (words, variant) in enumerate(variants.items()):
+            prior = self.prior(networks, variant)
+            runner = Batched(PairEnergy(prior, pair, 0, codes), starts)
+            memory = self.memory(runner, prior)
+            off = deviation(gradient(runner), exact)
+            theirs = Contender(runner, Arithmetic(operations, peak(self.device, DTYPES[variant.dtype])), memory)
+            note += f"; {words}: gradient off by {off:.1g}, the device's peak {theirs.arithmetic.peak}"
+            for section in self.against(words, theirs, ours):
+                entry = {words: {**section.record, "gradient_deviation": off}} if section.record else {}
+                done = (number + section.done) / len(variants)
+                yield Section(title, (VARIANT, PLAIN), [*figures, *section.figures], {**record, **entry}, done, note)
+            note += halved(prior, self.max_batch)
+            figures += section.figures
+            record |= entry
+
+    def against(self, words: str, theirs: Contender, ours: Contender) -> Iterator[Section]:
+        """A variant's section."""
+        both = {VARIANT: theirs, PLAIN: ours}
+        match = Match(words, f"{words}: seconds a step", self.work(theirs.runner), self.work(ours.runner), rate=False)
+        for section in compete("", (VARIANT, PLAIN), [match], self.rounds, self.device):
+            figures, record = list(section.figures), {}
+            if figures:
+                shares = [
+                    each.arithmetic.share(seconds)
+                    for each, seconds in zip(both.values(), (figures[0].first, figures[0].second), strict=True)
+                ]
                 figures.append(Figure(f"{words}: share of peak", *shares))
-                record[words]["share_of_peak"] = dict(zip(both, shares, strict=True))
-                if memory:
-                    figures.append(Figure(f"{words}: peak memory, GB", *(memory[each] / 1e9 for each in both.values())))
-                    record[words]["peak_bytes"] = {name: memory[each] for name, each in both.items()}
+                record = {
+                    "seconds_per_step": section.record[words],
+                    "arithmetic": {name: each.arithmetic.record() for name, each in both.items()},
+                    "share_of_peak": dict(zip(both, shares, strict=True)),
+                }
+                if ours.peak_bytes:
+                    gigabytes = (each.peak_bytes / 1e9 for each in both.values())
+                    figures.append(Figure(f"{words}: peak memory, GB", *gigabytes))
+                    record["peak_bytes"] = {name: each.peak_bytes for name, each in both.items()}
             yield replace(section, figures=figures, record=record)
 
-    def first_gradient(self, words: str, runner: Batched, prior: Zero123Prior, memory: dict[str, int]) -> torch.Tensor:
-        """The gradient before the first step, and on a GPU the memory of it: later a recorded step takes no more."""
-        found: list[torch.Tensor] = []
-        if self.device.type == "cuda":
-            memory[words] = peak_bytes(lambda: found.append(gradient(runner)), self.device)
-            memory[words] += sum(each.nbytes for each in prior.unet.parameters())
-        else:
-            found.append(gradient(runner))
-        return found[0]
+    def memory(self, runner: Batched, prior: Zero123Prior) -> int:
+        """Bytes of the first step, on a GPU, and of the U-Net's weights: once recorded a step takes no more."""
+        if self.device.type != "cuda":
+            return 0
+        step = peak_bytes(lambda: gradient(runner), self.device)
+        return step + sum(each.nbytes for each in prior.unet.parameters())
 
     def prior(self, networks: Networks, variant: Variant) -> Zero123Prior:
         """With a U-Net of its own."""

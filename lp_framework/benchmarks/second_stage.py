@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any, Literal
@@ -29,13 +29,14 @@ from lp_framework.priors.zero123.networks import (
 )
 from lp_framework.priors.zero123.prior import IMAGE_SIZE, Zero123Prior
 from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.descent import Adam, Plateau
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
-from lp_framework.solvers.twist import SineRadius, TwistPoses
+from lp_framework.solvers.twist import SineRadius, TanhRadius, TwistPoses
 
 BATCHED, LOOP = "batched", "plain loop"
 TIMESTEP = 500  # the work is that of any other
-LEARNING_RATE = 0.1
+LEARNING_RATE, FACTOR, PATIENCE = 0.1, 0.6, 10
 
 Architecture = Literal["published", "narrow"]
 NARROW: Configs = {  # the same layers, few and narrow: to try the measurement in seconds
@@ -59,23 +60,39 @@ def check_counts(name: str, starts: Sequence[int]) -> None:
         raise UserError(f"{name} must list numbers of starts, at least 1 each, got {starts}")
 
 
-class Batched:
-    """This package's step: both directions of all starts `[1, N, 3]` in one batch, one Adam over all poses.
+def halved(prior: Zero123Prior, max_batch: int | None) -> str:
+    """What to tell where a GPU had no memory for the samples that were to pass the U-Net at once."""
+    size = prior.chunks.size
+    return "" if size == max_batch else f" ({size} samples at once, for want of memory)"
 
-    Images are encoded when `energy` is made, and weights have no gradients.
+
+class Batched:
+    """This package's step, as `two_stage` has it: both directions of all starts `[1, N, 3]` in one batch.
+
+    Images are encoded when `energy` is made; weights have no gradients; twists, rates and losses stay on the device.
     """
 
     def __init__(self, energy: PairEnergy, starts: Tensor) -> None:
         self.energy, self.steps = energy, 0
-        self.poses = starts.clone().requires_grad_()
-        self.optimizer = torch.optim.Adam([self.poses], LEARNING_RATE)
+        self.pose_of = TwistPoses(starts.clone(), TanhRadius())
+        self.twist, self.total = starts.new_zeros(*starts.shape[:2], 6), starts.new_zeros(starts.shape[:2])
+        self.adam = Adam(self.twist, LEARNING_RATE)
+        self.plateau = Plateau(self.adam, FACTOR, PATIENCE)
+
+    @property
+    def poses(self) -> Tensor:
+        """Where the starts have come to, `[1, N, 3]`."""
+        return self.pose_of(self.twist)
 
     def step(self) -> None:
         """One update of all starts."""
         noise = self.energy.noise(self.steps)[:, 0]
-        self.optimizer.zero_grad()
-        self.energy(self.poses, TIMESTEP, noise).sum().backward()
-        self.optimizer.step()
+        twist = self.twist.requires_grad_()
+        energies = self.energy(self.pose_of(twist), TIMESTEP, noise)
+        (gradient,) = torch.autograd.grad(energies.sum(), twist)
+        self.twist = (twist + self.adam.step(gradient)).detach()
+        self.total = self.total + energies.detach()
+        self.plateau.step(self.total)
         self.steps += 1
 
 
@@ -95,7 +112,7 @@ class PlainLoop:
         self.poses = TwistPoses(start.cpu(), SineRadius())
         self.twist = torch.zeros(6, requires_grad=True)
         self.optimizer = torch.optim.Adam([self.twist], LEARNING_RATE)
-        self.scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(self.optimizer, factor=0.6, patience=10)
+        self.scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(self.optimizer, factor=FACTOR, patience=PATIENCE)
 
     def loss(self, pose: Tensor, noise: Tensor) -> Tensor:
         """Mean squared error of both directions for a pose `[3]` and noise `[2, *latent_shape]`."""
@@ -154,6 +171,8 @@ class SecondStage:
         work = self.work()
         batch_prior, loop_prior = self.priors()
         pair = random_pair(self.device)
+        if self.device.type == "cuda":
+            batch_prior.encode(pair.images)  # the first time prepares it
         began = now(self.device)
         energy = PairEnergy(batch_prior, pair, seed=0)
         encoding = now(self.device) - began
@@ -177,9 +196,10 @@ class SecondStage:
                         seconds += stretch / self.steps
                         measured[count][name].peak = max(measured[count][name].peak, peak)
                         done += count // len(runners)
-                        yield self.section(measured, work, encoding, done / total)
+                        few = halved(batch_prior, self.max_batch)
+                        yield self.section(measured, work, encoding, done / total, few)
                     measured[count][name].seconds.append(seconds)
-                yield self.section(measured, work, encoding, done / total)
+                yield self.section(measured, work, encoding, done / total, few)
 
     def work(self) -> dict[str, Arithmetic]:
         """What a start's step takes of either contender, counted on the meta device: nothing is computed."""
@@ -190,11 +210,17 @@ class SecondStage:
         loop = PlainLoop(loop_prior, pair.images, torch.zeros(3))
         pose = torch.zeros(3, device=meta.device, requires_grad=True)
         noise = torch.empty(2, *loop_prior.latent_shape, device=meta.device)
-        steps: dict[str, tuple[Callable[[], None], Dtype]]
-        steps = {BATCHED: (batched.step, self.dtype), LOOP: (lambda: loop.loss(pose, noise).backward(), "float32")}
         return {
-            name: Arithmetic(counted(step), peak(self.device, DTYPES[dtype]), launched(step))
-            for name, (step, dtype) in steps.items()
+            BATCHED: Arithmetic(
+                counted(batched.step),
+                peak(self.device, DTYPES[self.dtype]),
+                None if self.compile or self.cuda_graph else launched(batched.step),  # which are there to spare them
+            ),
+            LOOP: Arithmetic(
+                counted(lambda: loop.loss(pose, noise).backward()),
+                peak(self.device, torch.float32),
+                launched(lambda: loop.loss(pose, noise).backward()),
+            ),
         }
 
     def priors(self) -> tuple[Zero123Prior, Zero123Prior]:
@@ -238,6 +264,7 @@ class SecondStage:
         work: Mapping[str, Arithmetic],
         encoding: float,
         done: float,
+        few: str,
     ) -> Section:
         """The figures of those numbers of starts that both contenders have gone through."""
         figures: list[Figure] = []
@@ -271,7 +298,8 @@ class SecondStage:
                 "arithmetic_per_start": {name: one.record() for name, one in work.items()},
             },
             done,
-            f"Zero123's {self.architecture} size, random weights. {BATCHED}: all starts and both directions together, "
-            f"images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images anew each step; "
+            f"Zero123's {self.architecture} size, random weights. {BATCHED}: all starts and both directions "
+            f"together{few}, images encoded once ({encoding:.3g} s, not counted); "
+            f"{LOOP}: a start at a time, images anew each step; "
             + "; ".join(f"{name}: a start's step is {one}" for name, one in work.items()),
         )

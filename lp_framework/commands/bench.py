@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import platform
 import typing
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -59,20 +61,30 @@ def run(config: DictConfig) -> None:
         "versions": versions(),
     }
     sections: dict[str, Section] = {}
-    for name in names:
-        measurement = MEASUREMENTS[name](config, device)
-        with _progress() as progress:
-            task = progress.add_task(name, total=1.0)
-            for section in measurement:
-                sections[name] = section
-                write_json(folder / RESULT, {**{key: each.record for key, each in sections.items()}, **facts})
-                progress.update(task, completed=section.done)
+    try:
+        for name in names:
+            with _progress() as progress:
+                task = progress.add_task(name, total=1.0)
+                for section in MEASUREMENTS[name](config, device):
+                    sections[name] = section
+                    write_json(folder / RESULT, {**{key: each.record for key, each in sections.items()}, **facts})
+                    progress.update(task, completed=section.done)
+            gc.collect()  # the networks of a measurement, lest the next one finds the GPU full
+            if device.type == "cuda":
+                torch.cuda.empty_cache()
+    finally:
+        if sections:
+            show(list(sections.values()), folder / RESULT)
+
+
+def show(sections: Sequence[Section], results: Path) -> None:
+    """What has been measured, on the terminal."""
     console = Console(highlight=False, width=None if Console().is_terminal else 110)
-    console.print(table(list(sections.values())))
-    for section in sections.values():
+    console.print(table(sections))
+    for section in sections:
         if section.note:
             console.print(f"{section.title.partition(':')[0]}: {section.note}")
-    console.print(f"results: {folder / RESULT}", soft_wrap=True)
+    console.print(f"results: {results}", soft_wrap=True)
 
 
 # ---------------------------------------------------------------- the measurements, with what they need of the config

@@ -16,13 +16,14 @@ _Result = TypeVar("_Result")
 class Chunks:
     """Runs a function on slices of a batch, at most `size` long (None: all of it).
 
-    When a GPU runs out of memory the size is halved for good and the rest of the batch tried again. Not so where the
-    networks are divided among the processes of `group`: there all have to run the function equally often, and one with
-    fewer slices than others runs its last one again.
+    When a GPU runs out of memory, `release` gives back what it can and says whether that was anything; else the size is
+    halved for good. Then the rest of the batch is tried again. Not so where the networks are divided among the
+    processes of `group`: there all have to run the function equally often, and one with fewer slices than others runs
+    its last one again.
     """
 
-    def __init__(self, size: int | None) -> None:
-        self.size = size
+    def __init__(self, size: int | None, release: Callable[[], bool] | None = None) -> None:
+        self.size, self.release = size, release
         self.group: distributed.ProcessGroup | None = None
 
     def run(self, function: Callable[[slice], _Result], batch: int) -> list[_Result]:
@@ -36,9 +37,10 @@ class Chunks:
             try:
                 results.append(function(slice(start, stop)))
             except torch.cuda.OutOfMemoryError:
-                if stop - start == 1:
-                    raise
-                self.size = (stop - start) // 2
+                if self.release is None or not self.release():
+                    if stop - start == 1:
+                        raise
+                    self.size = (stop - start) // 2
             else:
                 start = stop
                 continue

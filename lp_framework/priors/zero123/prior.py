@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -68,8 +69,10 @@ class Zero123Prior(Prior):
         self.eval().requires_grad_(False)
         side = IMAGE_SIZE // 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size, self.latent_shape = IMAGE_SIZE, (int(self.vae.config.latent_channels), side, side)
-        self.channels_last, self.chunks = channels_last, Chunks(max_batch)
-        self.replayed = Replayed(self._energy_and_slope) if cuda_graph else None
+        self.channels_last = channels_last
+        self.replayed = Replayed() if cuda_graph else None
+        release = None if self.replayed is None else self.replayed.forget
+        self.chunks, self.image_chunks = Chunks(max_batch, release), Chunks(max_batch, release)
         alphas = scaled_linear_alphas()
         self.num_timesteps = len(alphas)
         self.register_buffer("alphas_cumprod", alphas, persistent=False)
@@ -94,7 +97,7 @@ class Zero123Prior(Prior):
             fully_shard(block, mesh=mesh)
         for network in (unet, self.image_encoder, self.vae.encoder, self.vae.decoder):
             fully_shard(network, mesh=mesh)
-        self.chunks.group = mesh.get_group(mesh.ndim - 1)
+        self.chunks.group = self.image_chunks.group = mesh.get_group(mesh.ndim - 1)
 
     # ------------------------------------------------------------ images
 
@@ -106,7 +109,8 @@ class Zero123Prior(Prior):
         size = [self.image_size, self.image_size]
         if list(images.shape[-2:]) != size:
             images = functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
-        parts = self.chunks.run(lambda part: (self._latent(images[part]), self._embedding(images[part])), len(images))
+        encode = self.image_chunks.run
+        parts = encode(lambda part: (self._latent(images[part]), self._embedding(images[part])), len(images))
         latents, embeddings = zip(*parts, strict=True)
         return ViewCode(torch.cat(latents), torch.cat(embeddings))
 
@@ -123,7 +127,7 @@ class Zero123Prior(Prior):
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
         """Images `[B, 3, image_size, image_size]` (not clipped) of unscaled latents `[B, *latent_shape]`."""
-        parts = self.chunks.run(lambda part: self.vae.decode(latent[part].to(self.vae.dtype)).sample, len(latent))
+        parts = self.image_chunks.run(lambda part: self.vae.decode(latent[part].to(self.vae.dtype)).sample, len(latent))
         return torch.cat(parts).float()
 
     # ------------------------------------------------------------ the energy
@@ -162,7 +166,8 @@ class Zero123Prior(Prior):
 
         inputs = pose, target.latent, source.latent, source.embedding, timestep, noise
         if pose.requires_grad and torch.is_grad_enabled():
-            both = self.replayed or self._energy_and_slope
+            replayed, function = self.replayed, self._energy_and_slope
+            both = function if replayed is None else partial(replayed, function)
             energies, _ = EnergyAndSlope.apply(pose, lambda part: both(*(each[part] for each in inputs)), self.chunks)
             return energies
         return torch.cat(self.chunks.run(lambda part: self._energy(*(each[part] for each in inputs)), len(pose)))
