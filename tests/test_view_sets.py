@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import html
+import math
 from collections import Counter
 
 import numpy as np
@@ -13,6 +15,7 @@ from view_folders import write_objects
 
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
+from lp_framework.evaluation.examples import read_examples
 from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution
 from lp_framework.solvers.starts import Random
@@ -160,7 +163,7 @@ def test_a_solver_of_pairs_gives_each_image_the_answer_of_its_pair(commands):
     rotation = np.array([float(row["rotation_error_degrees"]) for row in rows])
     assert metrics["R(R)@30"] == pytest.approx((rotation <= 30).mean())
     assert f"{len(rows)} poses in sets of 3 images" in ran.out
-    assert {file.stem for file in (ran.folder / "pictures").iterdir()} == {"errors", "objects"}
+    assert {file.stem for file in (ran.folder / "pictures").iterdir()} == {"errors", "objects", "examples"}
 
 
 def test_the_joint_solver_from_the_command_line(commands):
@@ -169,6 +172,17 @@ def test_the_joint_solver_from_the_command_line(commands):
     assert ran.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 3
     again = commands.here("again", "eval", "checkpoint=score", "solver=multiview", "views=4", "start=random")
     assert (again.folder / "pairs.csv").read_bytes() == (ran.folder / "pairs.csv").read_bytes()
+    by_pair = {(row["object"], row["reference"], row["query"]): row for row in pair_rows(ran)}
+    examples = read_examples(ran.folder / "pictures" / "examples")
+    assert {each.object for each in examples} == {*OBJECTS} and examples[0].rotation_errors[0] >= examples[
+        -1
+    ].rotation_errors[0]
+    for example in examples:  # the answers of the sets, which are not those of the pairs by themselves
+        row = by_pair[example.object, example.reference.name, example.query.name]
+        assert float(row["longitude_degrees"]) == pytest.approx(math.degrees(example.ends[0, 1]), abs=0.02)
+        assert example.trajectories is None and len(example.ends) == 1
+    page = (ran.folder / "report.html").read_text()
+    assert "the solver's steps were not kept" in html.unescape(page) and "slider plays" not in page
     fit = commands.here(
         "fit", "eval", "checkpoint=score", "solver=multiview", "solver.second_stage=false", "views=4", "start=random"
     )

@@ -29,9 +29,10 @@ from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.landscape import Landscape, landscape_grid, model_landscape, prior_landscapes
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import write_text
+from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs, Solver, pairs_of
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, pairs_of
 
 EXAMPLES, FILE = "examples", "examples.json"  # the folder among the pictures, and the file in it
 MOST = 6
@@ -39,6 +40,7 @@ SIDE = 192  # pixels of an image that is kept
 TIMESTEPS = (100, 300, 500, 700, 900)
 # A prior's landscapes may take half a minute, or this share of the time that the solver took for all pairs.
 SECONDS, SHARE = 30.0, 0.1
+NO_COST = Cost(network_passes=0, seconds=0.0)
 ABOUT = (
     "Poses are (latitude, longitude, radius) in radians and object sizes; relative ones are query minus reference. "
     "Errors are degrees and object sizes, one a start; a trajectory goes from its start to its end."
@@ -96,7 +98,8 @@ class Example:
 def gather_examples(evaluation: Evaluation, data: PairData) -> list[Example]:
     """After `Trainer.test`: up to `MOST` pairs, the largest error first, solved again to see their trajectories.
 
-    Starts and draws are the evaluation's, so the answers are its answers; the errors are those that it counted.
+    Starts and draws are the evaluation's, so the answers are its answers; the errors are those that it counted. Pairs
+    of sets of images are not solved again, for their answers came of all images of a set: they have no trajectories.
     """
     rows, table = evaluation.metrics.rows(), evaluation.table
     rotation, translation, chosen, objects = (
@@ -108,7 +111,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[Example]:
     assert data.images is not None  # evaluation never caches features
     pairs = pairs_of(batch, table, evaluation.device)
     starts = evaluation.starts.make(pairs.ids, evaluation.seed)
-    solution = recording(evaluation.solver).solve(pairs, starts, evaluation.seed)
+    solution = _retraced(evaluation, pairs, starts, rows["answer"][[pick.row for pick in picks]])
     truth = batch.relative_poses()
     landscapes = _landscapes(evaluation, pairs, truth[:, 2])
     examples = []
@@ -137,6 +140,15 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[Example]:
             )
         )
     return examples
+
+
+def _retraced(evaluation: Evaluation, pairs: Pairs, starts: Tensor, answers: Tensor) -> Solution:
+    """The solution of pairs with its trajectories, from starts `[B, N, 3]`; of sets of images the answers `[B, 3]`."""
+    if not isinstance(evaluation, ViewSetEvaluation):
+        return recording(evaluation.solver).solve(pairs, starts, evaluation.seed)
+    poses = answers[:, None].to(starts)
+    unknown, first = torch.full_like(poses[..., 0], torch.nan), torch.zeros_like(pairs.ids)
+    return Solution(poses, unknown, valid=poses.isfinite().all(dim=-1), chosen=first, cost=NO_COST)
 
 
 def pick_pairs(errors: NDArray, objects: NDArray, unique_answer: Sequence[bool | None]) -> list[Pick]:

@@ -51,10 +51,8 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
     """After `Trainer.test`: fields of some pairs (failures first), cumulative errors, and the objects, into `folder`.
 
     Each as PNG and PDF; returns the PNG files. The errors shown are the evaluation's; the fields' pairs are solved
-    again to see their trajectories, with the same starts and draws. `EXAMPLES` below it gets what the page of the run
-    is drawn from.
+    again to see their trajectories, with the same starts and draws.
     """
-    save_examples(folder / EXAMPLES, gather_examples(evaluation, data))
     evaluation.eval()
     rows, table = evaluation.metrics.rows(), evaluation.table
     rotation, translation = rows["rotation"].numpy(), rows["translation"].numpy()
@@ -75,7 +73,11 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
 
 
 def save_summaries(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
-    """After `Trainer.test`, of pairs or sets: the cumulative errors and the objects; as `save_pictures`."""
+    """After `Trainer.test`, of pairs or sets: the cumulative errors and the objects; as `save_pictures`.
+
+    `EXAMPLES` below the folder gets what the page of the run is drawn from.
+    """
+    save_examples(folder / EXAMPLES, gather_examples(evaluation, data))
     rows, table = evaluation.metrics.rows(), evaluation.table
     classes = [table.ambiguities[index] for index in rows["object"].tolist()]
     rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))

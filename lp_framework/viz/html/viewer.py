@@ -37,11 +37,12 @@ def viewer(examples: Sequence[Example], data: Data) -> Html:
     words = (
         f"{failures} of the {len(shown)} pairs are off by more than 30°" if failures else "None of these pairs failed"
     )
-    advice = "The slider plays the solver's steps."
-    if len(shown) > 1:
-        advice = f"{words}. Choose one; the slider plays the solver's steps."
+    plays = any(example.trajectories is not None for example in shown)
+    steps = "the slider plays the solver's steps." if plays else "the solver's steps were not kept."
+    advice = f"{words}. Choose one; {steps}" if len(shown) > 1 else steps.capitalize()
+    over = "the way from every start over it" if plays else "where the answer lies on it"
     figures = [
-        _figure("map", "wide", "The landscape at the true relative radius, and the way from every start over it."),
+        _figure("map", "wide", f"The landscape at the true relative radius, and {over}."),
         _figure("surface", "surface-figure", "The same as relief; drag to turn it."),
         _figure(
             "cameras",
