@@ -201,7 +201,9 @@ def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
     assert [row["val/loss"] for row in every[: len(first)]] == [row["val/loss"] for row in first]
     assert [row["epoch"] for row in every if row["val/loss"]] == ["0", "1", "2"]
     finished = commands.here("finished", "train", "resume=prolonged")  # not up to the default number of epochs
-    assert finished.error == "resume=prolonged: has done all of its epochs; trainer.max_epochs=N would prolong it"
+    assert finished.error == (
+        "prolonged: has done all of its epochs; resume=prolonged trainer.max_epochs=N would prolong it"
+    )
     (commands.folder / "prolonged" / "training.json").unlink()  # as if it had been killed at the very end
     assert commands.here("reported", "train", "resume=prolonged").status == 0
     assert (commands.folder / "prolonged" / "training.json").is_file()
@@ -220,6 +222,38 @@ def test_a_last_checkpoint_cut_short_gives_way_to_the_best(commands, score, cut)
     assert ran.status == 0, ran.err
     assert re.search(r"WARNING: .*last\.ckpt: .*; going on from .*best\.ckpt", ran.err)
     assert torch.load(last, weights_only=True)["epoch"] == 3
+
+
+def test_the_same_command_goes_on_in_its_folder_and_another_does_not_write_over_it(commands, score):
+    weights = score.checkpoint()["state_dict"]
+    assert commands.here("score", "train").error.startswith("score: has done all of its epochs")
+    assert commands.here("score", "train", "model=energy").error.startswith(
+        "score: holds a training run with other set"
+    )
+    assert_equal(score.checkpoint()["state_dict"], weights)
+    (score.folder / "training.json").unlink()
+    assert commands.here("score", "train").status == 0  # the report was missing
+    assert_equal(score.checkpoint()["state_dict"], weights)
+
+
+def test_a_training_that_diverges_is_an_error_and_its_model_is_not_taken(commands, monkeypatch):
+    ran = commands.here("runs/train/far", "train", "model.learning_rate=1e30", "trainer.max_epochs=1")
+    assert ran.status == 1 and re.search(r"error: .*far: the training has diverged \(.*loss.*: not finite\)", ran.err)
+    monkeypatch.chdir(commands.folder)
+    assert "far" not in str(default_checkpoint())
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("ema=2", "ema must be a share from 0 to 1, or null for none; got 2"),
+        ("ema=abc", "ema must be"),
+        ("patience=-1", "patience must be a number of epochs, or null"),
+        ("trainer.max_epochs=0", "trainer.max_epochs must be at least 1, got 0"),
+    ],
+)
+def test_mistakes(commands, setting, sentence):
+    assert commands.here("mistake", "train", setting).error.startswith(sentence)
 
 
 def test_resuming_what_is_not_there_is_named(commands):

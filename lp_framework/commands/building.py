@@ -15,6 +15,7 @@ from typing import Any, TextIO
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning import Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback
@@ -27,7 +28,7 @@ from lp_framework import registry
 from lp_framework.composition import one_line
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
-from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint, load_model
+from lp_framework.models.checkpoints import SHIPPED, default_checkpoint, find_checkpoint, load_model
 from lp_framework.solvers.base import Solver
 
 log = logging.getLogger(__name__)
@@ -95,6 +96,30 @@ def build_solver(config: DictConfig, known: Path | None = None) -> tuple[Solver,
     if "prior" in wanted:
         components["prior"] = registry.build("prior", config.prior)
     return registry.build("solver", config.solver, **components), checkpoint
+
+
+def warn_of_unused(config: DictConfig) -> None:
+    """Of a prior or a checkpoint that the command line names and the solver does not ask for, say so.
+
+    Not in a sweep, which may go over solvers that do.
+    """
+    job, name = HydraConfig.get(), config.solver.name
+    wanted = registry.component_names(registry.get("solver", name))
+    named = {override.partition("=")[0].strip("+~").partition(".")[0] for override in job.overrides.task}
+    for key, component in (("prior", "prior"), ("checkpoint", "model")):
+        if key in named and component not in wanted and job.mode != RunMode.MULTIRUN:
+            log.warning("%s=... has no effect: solver=%s takes no %s", key, name, component)
+
+
+def model_origin(checkpoint: Path, chosen: object) -> str:
+    """Which model a solver has, for the terminal; `chosen` is the config's `checkpoint`."""
+    if checkpoint.is_relative_to(SHIPPED):
+        return "the one that ships"
+    return (
+        str(checkpoint)
+        if chosen is not None
+        else f"{checkpoint} (of the latest training run; checkpoint=... for others)"
+    )
 
 
 def seed_run(seed: object) -> None:

@@ -22,12 +22,14 @@ from lp_framework import registry
 from lp_framework.api import image_batch, move
 from lp_framework.commands.building import (
     build_solver,
+    model_origin,
     orderly_console,
     plain,
     run_folder,
     seed_run,
     versions,
     warn_of_photographs,
+    warn_of_unused,
 )
 from lp_framework.commands.device import choose_device
 from lp_framework.data.camera_files import colmap_model, nerf_transforms
@@ -87,6 +89,7 @@ def run(config: DictConfig) -> None:
     files = photograph_files(config.images)
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
 
+    warn_of_unused(config)
     solver, checkpoint = build_solver(config)
     move(solver, device)
     starts = registry.build("start", config.start)
@@ -117,7 +120,7 @@ def run(config: DictConfig) -> None:
         "versions": versions(),
     }
     _write(folder, estimated, prepared, result)
-    _print(folder, estimated)
+    _print(folder, estimated, None if checkpoint is None else model_origin(checkpoint, config.checkpoint))
     warn_of_prior(config)
 
 
@@ -166,7 +169,7 @@ def _write(folder: Path, views: Sequence[View], prepared: Sequence[Image.Image],
     save_figure(cameras_figure(poses.numpy(), pixels, numbers, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
 
 
-def _print(folder: Path, views: Sequence[View]) -> None:
+def _print(folder: Path, views: Sequence[View], model: str | None) -> None:
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("", no_wrap=True)
@@ -182,6 +185,8 @@ def _print(folder: Path, views: Sequence[View]) -> None:
         else:
             table.add_row(view.file.name, "none")
     console.print(table)
+    if model is not None:
+        console.print(f"model:   {model}", soft_wrap=True)
     for what, path in (
         ("poses", "transforms.json, poses.csv"), ("COLMAP", "colmap"), ("images", "images"), ("picture", "cameras.png"),
     ):  # fmt: skip

@@ -23,11 +23,13 @@ from lp_framework.commands.building import (
     build_data,
     build_solver,
     build_trainer,
+    model_origin,
     orderly_console,
     plain,
     run_folder,
     seed_run,
     versions,
+    warn_of_unused,
     weights_fingerprint,
 )
 from lp_framework.commands.finished import is_finished, unfinished_evaluation
@@ -62,6 +64,7 @@ def run(config: DictConfig) -> None:
     if config.trainer.get("precision", "32-true") != "32-true":
         raise UserError("trainer.precision: poses are computed in float32; prior.dtype=bfloat16 is Zero123's own")
     seed_run(config.seed)
+    warn_of_unused(config)
     solver, checkpoint = build_solver(config, known)
     subject = {
         "config": json.loads(json.dumps(plain(config))),
@@ -144,6 +147,9 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
     title = f"{choices}, {result['pairs']} {counted}"
     console.print(terminal_table(title, summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
+    if result["checkpoint"] is not None:
+        origin = model_origin(Path(result["checkpoint"]), config["checkpoint"])
+        console.print(f"model:    {origin}", soft_wrap=True)
     if result["unanswered"]:
         console.print(f"no answer for {result['unanswered']:.1%} of the pairs")
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)

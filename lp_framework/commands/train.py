@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning import Trainer
 from lightning.pytorch.callbacks import (
     Callback,
@@ -23,6 +24,7 @@ from lightning.pytorch.callbacks import (
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from yaml import YAMLError
 
 from lp_framework import registry
 from lp_framework.commands.building import (
@@ -53,20 +55,32 @@ TRAINING_STATE = {"epoch": int, "global_step": int, "loops": dict, "optimizer_st
 
 @orderly_console()
 def run(config: DictConfig) -> None:
-    """Train into this run's folder, or go on in the folder that `resume` names."""
+    """Train into this run's folder, or go on in the folder that `resume` names, or where this very run was stopped."""
     folder = run_folder()
     last, checkpoint = None, None
     if config.resume is not None:
         folder = Path(config.resume)
         config = resumed_config(folder, config, HydraConfig.get().overrides.task)
         last, checkpoint = last_checkpoint(folder)
+    elif _has_begun(folder):
+        _check_same(folder, config)
+        last, checkpoint = last_checkpoint(folder)
+        if is_finished(folder, config, checkpoint) and HydraConfig.get().mode == RunMode.MULTIRUN:
+            print(f"skipped, finished before: {folder}")
+            return
     recipe = {"model": plain(config.model), "backbone": plain(config.backbone)}
     if checkpoint is not None and checkpoint[RECIPE] != recipe:
         raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
     if checkpoint is not None and is_finished(folder, config, checkpoint):
-        raise UserError(f"resume={folder}: has done all of its epochs; trainer.max_epochs=N would prolong it")
+        raise UserError(f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it")
     if config.trainer.strategy == DIVIDED:
         raise UserError(f"trainer.strategy={DIVIDED} divides the prior of an eval; models are trained whole, take ddp")
+    if config.trainer.max_epochs == 0:
+        raise UserError("trainer.max_epochs must be at least 1, got 0")
+    if config.ema is not None and not (isinstance(config.ema, int | float) and 0 <= config.ema <= 1):
+        raise UserError(f"ema must be a share from 0 to 1, or null for none; got {config.ema}")
+    if config.patience is not None and not (isinstance(config.patience, int) and config.patience >= 0):
+        raise UserError(f"patience must be a number of epochs, or null for no early stop; got {config.patience}")
     seed_run(config.seed)
     data = build_data(config)
     backbone = registry.build("backbone", config.backbone)
@@ -89,11 +103,28 @@ def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -
     A run may be prolonged or moved to other devices; all else stays as it was, and `UserError` is raised for it.
     """
     saved = folder / "config.yaml"
-    if not saved.is_file() or not any((folder / FOLDER / name).is_file() for name in (LAST, BEST)):
+    if not saved.is_file() or not _has_begun(folder):
         raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
     previous = OmegaConf.load(saved)
     assert isinstance(previous, DictConfig)
     return with_overrides(previous, config, overrides, ("trainer",), saved)
+
+
+def _has_begun(folder: Path) -> bool:
+    return any((folder / FOLDER / name).is_file() for name in (LAST, BEST))
+
+
+def _check_same(folder: Path, config: DictConfig) -> None:
+    """`UserError` where the run in `folder` has another config than this one: what it learned is not overwritten."""
+    try:
+        previous = OmegaConf.load(folder / "config.yaml")
+    except (OSError, ValueError, YAMLError):
+        previous = OmegaConf.create()
+    if previous != config:
+        raise UserError(
+            f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
+            "another hydra.run.dir"
+        )
 
 
 def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
@@ -182,6 +213,9 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
          "final": losses, "objects": data.table("train").names,
          "fingerprints": {"views": data.fingerprint("all_train")}, "versions": versions()},
     )  # fmt: skip
+    if len(finite) < len(losses):
+        diverged = ", ".join(sorted({*losses} - {*finite}))
+        raise UserError(f"{folder}: the training has diverged ({diverged}: not finite); lower model.learning_rate")
     console = Console(soft_wrap=True, highlight=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
     console.print(f"model:   {folder / FOLDER / BEST}")

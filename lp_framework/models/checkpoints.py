@@ -73,11 +73,16 @@ def find_checkpoint(path: str | Path) -> Path:
 
 
 def default_checkpoint(runs: str | Path = "runs/train") -> Path:
-    """The latest training run's pose model below the working directory; where there is none, the one that ships."""
+    """The latest training run's pose model below the working directory; where there is none, the one that ships.
+
+    Runs of priors are passed over, and those that diverged.
+    """
     found = sorted(Path(runs).glob(f"*/{FOLDER}/{LAST}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in found:
         best = find_checkpoint(file.parents[1])
-        if issubclass(registry.get("model", read_checkpoint(best)[RECIPE]["model"]["name"]), PoseModel):
+        checkpoint = read_checkpoint(best)
+        finite = all(each.isfinite().all() for each in checkpoint["state_dict"].values())
+        if finite and issubclass(registry.get("model", checkpoint[RECIPE]["model"]["name"]), PoseModel):
             return best
     return SHIPPED / "score" / WEIGHTS
 
