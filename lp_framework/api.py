@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution, Solver
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.solvers.starts import Starts
+
+TINY_KNOWS = "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing"
 
 
 def estimate_pose(
@@ -59,6 +62,8 @@ def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel |
         components["model"] = model if isinstance(model, PoseModel) else lp_framework.load_model(model)
     if "prior" in wanted:
         components["prior"] = prior if isinstance(prior, Prior) else registry.build("prior", prior)
+        if prior == "tiny":
+            warnings.warn(f"{TINY_KNOWS}. For photographs take load_prior('zero123xl', path=...)", stacklevel=4)
     solver: Solver = registry.build("solver", name, **components)
     return solver
 

@@ -93,6 +93,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
     except Exception as error:
         if str(error).startswith(HYDRA_VALUE_ERRORS):
             raise UsageError(one_line(error)) from error
+        if isinstance(error, OSError) and not _in_a_job(error):
+            raise UsageError(f"this run's folder cannot be made: {one_line(error)}") from error
         if _while_composing(error):
             raise UsageError(f"this makes no configuration ({type(error).__name__}: {one_line(error)})") from error
         raise
@@ -155,6 +157,12 @@ def _leave_processes() -> None:
     distributed = sys.modules.get("torch.distributed")
     if distributed is not None and distributed.is_available() and distributed.is_initialized():
         distributed.destroy_process_group()
+
+
+def _in_a_job(error: Exception) -> bool:
+    """Whether an exception comes from a command, and not from Hydra before or after it."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(frame.f_globals.get("__name__") == __name__ and frame.f_code.co_name == "task" for frame in frames)
 
 
 def _while_composing(error: Exception) -> bool:

@@ -232,7 +232,7 @@ def _check_types(group: str, name: str, cls: type, settings: Mapping[str, Any]) 
         return
     for key, value in settings.items():
         hint = hints.get(key, Any)
-        if not _fits(value, hint):
+        if not fits(value, hint):
             if typing.get_origin(hint) is typing.Literal:
                 choices = list(map(str, typing.get_args(hint)))
                 reason = f"is none of its values{nearest(str(value), choices)} (known: {', '.join(choices)})"
@@ -241,19 +241,19 @@ def _check_types(group: str, name: str, cls: type, settings: Mapping[str, Any]) 
             raise UserError(f"{group} '{name}': {key}={value} {reason}")
 
 
-def _fits(value: object, hint: Any) -> bool:
+def fits(value: object, hint: Any) -> bool:
     """Whether a plain value can be passed for a type hint; hints that are not of plain values take anything."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, each) for each in arguments)
+        return any(fits(value, each) for each in arguments)
     if origin is typing.Literal:
         return value in arguments
     if origin in (list, tuple, Sequence):
         if not isinstance(value, list | tuple):
             return False
         if origin is tuple and arguments[-1] is not Ellipsis:
-            return len(value) == len(arguments) and all(map(_fits, value, arguments))
-        return all(_fits(each, arguments[0]) for each in value)
+            return len(value) == len(arguments) and all(map(fits, value, arguments))
+        return all(fits(each, arguments[0]) for each in value)
     if hint in (int, float):
         kind = numbers.Integral if hint is int else numbers.Real
         return isinstance(value, kind) and not isinstance(value, bool)

@@ -107,6 +107,15 @@ def test_an_experiment_of_another_command_says_whose_it_is(lp, write):
     assert finished.error.endswith("; it goes with eval or estimate or landscape")
 
 
+@pytest.mark.parametrize("folder", ["hydra.run.dir=file/run", "hydra.run.dir=file", "hydra.sweep.dir=file/sweep"])
+def test_a_folder_that_cannot_be_made_is_named(lp, walker, write, jobs, folder):
+    write("file", "")
+    sweep = ("--multirun", "solver.steps=1,2") if "sweep" in folder else ()
+    finished = lp(*DEMO, folder, *sweep)
+    assert finished.status == 2 and not jobs
+    assert finished.error.startswith("this run's folder cannot be made: [Errno ")
+
+
 @pytest.mark.parametrize("command", ["train", "eval"])
 def test_so_does_one_that_only_sets_what_another_command_has(lp, command):
     """`train` has a backbone without the setting, `eval` none at all."""

@@ -293,7 +293,8 @@ def test_mistakes_name_the_picture():
 
 def test_it_works_out_of_the_box_and_names_mean_what_they_do_elsewhere():
     reference, query = placed(drawn(80, 60), 30, 20), placed(drawn(60, 80), 30, 20)
-    solution = lp_framework.estimate_pose(reference, query)
+    with pytest.warns(UserWarning, match="knows the twelve embedded objects"):
+        solution = lp_framework.estimate_pose(reference, query)
     assert solution.poses.shape == (1, 9, 3) and solution.valid.all() and solution.answer().isfinite().all()
     model = lp_framework.load_model(Path(lp_framework.__file__).parent / "weights" / "score")
     solver = lp_framework.load_solver("two_stage", model=model, prior=lp_framework.load_prior("tiny"))

@@ -280,6 +280,30 @@ def recipe(commands: Commands, group: str, **changes: Any) -> dict[str, Any]:
     return {**contents, group: {**contents[group], **changes}}
 
 
+def test_what_a_solver_does_not_take_is_said_and_its_model_is_named(commands):
+    quick = ("solver.iterations=1", "checkpoint=score")
+    ran = commands.here("unused", "eval", *quick, "prior.path=nowhere")
+    assert ran.status == 0 and "WARNING: prior=... has no effect: solver=langevin takes no prior" in ran.err
+    assert f"model:    {Path('score/checkpoints/best.ckpt')}\n" in ran.out
+    ran = commands.here("unused_model", "eval", "checkpoint=nowhere", "solver=features")
+    assert "WARNING: checkpoint=... has no effect: solver=features takes no model" in ran.err
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("log_every_n_steps=abc", "trainer.log_every_n_steps=abc is not of its type, Optional[int]"),
+        (
+            "deterministic=maybe",
+            "trainer.deterministic=maybe is not of its type, Union[bool, Literal['warn'], NoneType]",
+        ),
+        ("accelerator=tpu", "trainer: Requirement 'torch_xla"),
+    ],
+)
+def test_odd_settings_of_the_trainer(commands, setting, sentence):
+    assert commands.here("odd", "eval", f"++trainer.{setting}", "checkpoint=score").error.startswith(sentence)
+
+
 def test_a_checkpoint_that_is_not_there(commands):
     assert commands.here("x", "eval", "checkpoint=gone.ckpt").error == "gone.ckpt: there is no such checkpoint"
     assert commands.here("x", "eval", "checkpoint=views").error.startswith("views: holds no checkpoints/best.ckpt")

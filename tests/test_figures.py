@@ -185,10 +185,10 @@ def test_a_camera_panel_has_every_camera():
 
 
 def test_predicted_cameras_stand_where_the_solver_says(data):
-    figure = CamerasFigure(data, ExactPrior(), ["cup", "tram"], targets=3, methods=["ifusion"], starts=2)
+    figure = CamerasFigure(data, ExactPrior(), ["cup", "tram"], targets=5, methods=["ifusion"], starts=2)
     contents = figure.gather(0, CPU)
     assert [scene.title for scene in contents.scenes] == ["cup", "tram"] and contents.methods == ["iFusion"]
-    places = [(0, 1), (0, 2), (0, 3)]
+    places = [(0, 1), (0, 2), (0, 3)]  # there are no more
     shown = shown_pairs(data, ["cup"] * 3 + ["tram"] * 3, places * 2, CPU)
     solution = figure.solvers["ifusion"].solve(shown.pairs, figure.starts.make(shown.pairs.ids, 0), 0)
     cameras = apply_relative_pose(shown.poses[:, :1], solution.poses.detach().double()).numpy()
@@ -340,10 +340,6 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
         (["figure=landscapes", "figure.longitude_step_degrees=50"], "longitude_step_degrees must divide 360"),
         (["figure=landscapes", "figure.objects=[]"], "figure.objects needs the name of an object"),
         (["figure=trajectories", "figure.views=9"], "figure.views must be 2 to 5"),
-        (
-            ["figure=cameras", "figure.targets=9", "figure.objects=[cup]"],
-            "object 'cup' has test views 0 to 3, there is",
-        ),
         (["figure=cameras", "figure.methods=[ifuzion]"], "there is no solver 'ifuzion'; did you mean 'ifusion'"),
         (["figure=failures", "figure.views=1"], "figure.views must be 2 to 12"),
     ],

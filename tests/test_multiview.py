@@ -80,7 +80,7 @@ def test_the_fit_averages_the_first_stages_noise_over_starts_and_pairs():
         found[views, count] = (
             distance(solver.solve_views(sets, starts_of(sets, count), seed=0).poses, true).square().mean().sqrt().item()
         )
-    assert found[2, 1] > 0.4
+    assert found[2, 1] > 0.35
     assert found[2, 1] > 1.5 * found[8, 1] > 1.5 * found[8, 8]
     assert found[2, 1] > 1.5 * found[2, 8] > 1.5 * found[8, 8]
     assert found[8, 8] < 0.06

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import inspect
 import logging
 import platform
 import subprocess
+import typing
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from lp_framework import registry
+from lp_framework.api import TINY_KNOWS
 from lp_framework.composition import one_line
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
@@ -134,15 +137,20 @@ def build_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], l
     epochs = config.trainer.get("max_epochs", 1)
     if not isinstance(epochs, int) or epochs < 0:
         raise UserError(f"trainer.max_epochs must be a number of epochs, got {epochs}")
+    settings, hints = plain(config.trainer), typing.get_type_hints(Trainer.__init__)
+    for key, value in settings.items():
+        if key in hints and not registry.fits(value, hints[key]):
+            kind = inspect.formatannotation(hints[key]).replace("typing.", "")
+            raise UserError(f"trainer.{key}={value} is not of its type, {kind}")
     try:
         return Trainer(
-            **plain(config.trainer),
+            **settings,
             default_root_dir=folder,
             callbacks=callbacks,
             logger=logger,
             use_distributed_sampler=False,  # the data module's samplers know the processes
         )
-    except (MisconfigurationException, ValueError, TypeError) as error:
+    except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
         raise UserError(f"trainer: {one_line(error)}") from error
 
 
@@ -156,10 +164,7 @@ def run_folder() -> Path:
 def warn_of_photographs(prior: DictConfig) -> None:
     """Of the config of the prior that ships, say that it knows no photographs."""
     if prior.name == "tiny" and prior.path is None:
-        log.warning(
-            "prior=tiny as it ships knows the twelve embedded objects, uncropped; poses of anything else mean nothing. "
-            "For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER"
-        )
+        log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_KNOWS)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

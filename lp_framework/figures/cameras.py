@@ -38,8 +38,9 @@ class CameraContents(NamedTuple):
 class CamerasFigure(PaperFigure[CameraContents]):
     """True and predicted cameras around some objects, methods side by side, from a few random starts for each view.
 
-    The first test view of an object is the reference, the next `targets` are estimated. `methods` are solvers by name
-    with their default settings; those that ask for a model get that of `score`, a training run or a checkpoint.
+    The first test view of an object is the reference, the next `targets`, or all that there are, are estimated.
+    `methods` are solvers by name with their default settings; those that ask for a model get that of `score`, a
+    training run or a checkpoint.
     """
 
     def __init__(
@@ -63,8 +64,11 @@ class CamerasFigure(PaperFigure[CameraContents]):
 
     def gather(self, seed: int, device: torch.device) -> CameraContents:
         """All objects and views are solved together, a method after the other."""
-        objects = [name for name in self.objects for _ in range(self.targets)]
-        shown = shown_pairs(self.data, objects, [(0, k + 1) for k in range(self.targets)] * len(self.objects), device)
+        table = self.data.table("test")
+        fewest = min(len(table.objects[object_index(self.data, name)]) for name in self.objects)
+        targets = max(1, min(self.targets, fewest - 1))
+        objects = [name for name in self.objects for _ in range(targets)]
+        shown = shown_pairs(self.data, objects, [(0, k + 1) for k in range(targets)] * len(self.objects), device)
         starts = self.starts.make(shown.pairs.ids, seed)
         reference, query = (shown.poses[:, side, None] for side in (0, 1))
         predicted, near = [], []
@@ -73,18 +77,17 @@ class CamerasFigure(PaperFigure[CameraContents]):
                 solution = self.solvers[name].solve(shown.pairs, starts, seed)
             poses = apply_relative_pose(reference, solution.poses.detach().cpu().double())
             error = rotation_error(camera_to_world(poses), camera_to_world(query).expand(*poses.shape[:2], 4, 4))
-            predicted.append(poses.unflatten(0, (len(self.objects), self.targets)).numpy())
-            near.append((error <= NEAR_DEGREES).unflatten(0, (len(self.objects), self.targets)).flatten(1))
-        table = self.data.table("test")
+            predicted.append(poses.unflatten(0, (len(self.objects), targets)).numpy())
+            near.append((error <= NEAR_DEGREES).unflatten(0, (len(self.objects), targets)).flatten(1))
         scenes = []
         for number, name in enumerate(self.objects):
-            own = slice(number * self.targets, (number + 1) * self.targets)
+            own = slice(number * targets, (number + 1) * targets)
             views = table.objects[object_index(self.data, name)]
             scenes.append(
                 CameraScene(
                     words(name),
                     np.concatenate([shown.images[own][:1, 0], shown.images[own, 1]]),
-                    views.poses[: self.targets + 1].numpy(),
+                    views.poses[: targets + 1].numpy(),
                     np.asarray(read_image(views.files[0]).convert("RGBA")),
                     [poses[number] for poses in predicted],
                     [
@@ -102,7 +105,7 @@ class CamerasFigure(PaperFigure[CameraContents]):
         """See `PaperFigure`."""
         names = ", ".join(scene.title for scene in contents.scenes)
         return (
-            f"Predicted (thin) and true cameras (bold) of {self.targets} views of each object ({names}), relative to "
-            f"the reference (red), from {self.starts.count} random starts for each view: "
+            f"Predicted (thin) and true cameras (bold) of {len(contents.scenes[0].images) - 1} views of each object "
+            f"({names}), relative to the reference (red), from {self.starts.count} random starts for each view: "
             f"{' and '.join(contents.methods)}. Counted are the predictions within {NEAR_DEGREES:g} degrees."
         )

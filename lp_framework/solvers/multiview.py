@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import combinations, permutations
 from typing import NamedTuple
@@ -147,7 +148,8 @@ class MultiView(Solver):
         """The first stage on all ordered pairs and the fit of their ends."""
         sets, views = view_sets.views.shape
         reference, query = torch.tensor(list(permutations(range(views), 2))).T.tolist()
-        pair_starts = [starts[:, j - 1] if j > 0 else -starts[:, i - 1] for i, j in zip(reference, query, strict=True)]
+        back = torch.stack([-starts[..., 0], -starts[..., 1] % (2 * math.pi), -starts[..., 2]], dim=-1)
+        pair_starts = [starts[:, j - 1] if j > 0 else back[:, i - 1] for i, j in zip(reference, query, strict=True)]
         pairs = view_sets.pairs(reference, query)
         solution = self.first.solve(pairs, torch.stack(pair_starts, dim=1).flatten(0, 1), seed)
         measured = starts.new_full((sets, views, views, starts.shape[2], 3), torch.nan)
