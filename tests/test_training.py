@@ -256,6 +256,15 @@ def test_mistakes(commands, setting, sentence):
     assert commands.here("mistake", "train", setting).error.startswith(sentence)
 
 
+@pytest.mark.parametrize("content", ["{", "[1]", "seed: 1"])
+def test_a_damaged_configuration_is_named(commands, score, content):
+    folder = shutil.copytree(score.folder, commands.folder / f"damaged_{len(content)}")
+    (folder / "config.yaml").write_text(content)
+    sentence = f"{folder.name}/config.yaml: is not the configuration of a training run (missing or damaged)"
+    assert commands.here("onwards", "train", f"resume={folder.name}").error == sentence
+    assert commands.here(folder.name, "train").error == sentence
+
+
 def test_resuming_what_is_not_there_is_named(commands):
     ran = commands.here("nothing", "train", "resume=nowhere")
     assert ran.error.startswith("resume=nowhere: holds no checkpoints/last.ckpt to go on from")

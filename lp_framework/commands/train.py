@@ -105,9 +105,7 @@ def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -
     saved = folder / "config.yaml"
     if not saved.is_file() or not _has_begun(folder):
         raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
-    previous = OmegaConf.load(saved)
-    assert isinstance(previous, DictConfig)
-    return with_overrides(previous, config, overrides, ("trainer",), saved)
+    return with_overrides(_saved_config(saved, config), config, overrides, ("trainer",), saved)
 
 
 def _has_begun(folder: Path) -> bool:
@@ -116,15 +114,22 @@ def _has_begun(folder: Path) -> bool:
 
 def _check_same(folder: Path, config: DictConfig) -> None:
     """`UserError` where the run in `folder` has another config than this one: what it learned is not overwritten."""
-    try:
-        previous = OmegaConf.load(folder / "config.yaml")
-    except (OSError, ValueError, YAMLError):
-        previous = OmegaConf.create()
-    if previous != config:
+    if _saved_config(folder / "config.yaml", config) != config:
         raise UserError(
             f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
             "another hydra.run.dir"
         )
+
+
+def _saved_config(file: Path, config: DictConfig) -> DictConfig:
+    """The config in a run's folder, which has all keys of this one's."""
+    try:
+        saved = OmegaConf.load(file)
+    except (OSError, ValueError, YAMLError):
+        saved = None
+    if not isinstance(saved, DictConfig) or not {*config} <= {*saved}:
+        raise UserError(f"{file}: is not the configuration of a training run (missing or damaged)")
+    return saved
 
 
 def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
