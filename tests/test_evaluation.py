@@ -289,6 +289,19 @@ def test_what_a_solver_does_not_take_is_said_and_its_model_is_named(commands):
     assert "WARNING: checkpoint=... has no effect: solver=features takes no model" in ran.err
 
 
+def test_a_latest_model_of_other_objects_is_warned_of(commands):
+    latest = commands.folder / "runs" / "train" / "latest"
+    shutil.copytree(commands.folder / "score", latest)
+    try:
+        for objects, warned in ((["zebra"], True), (["zebra", "cup"], False)):
+            (latest / "training.json").write_text(json.dumps({"objects": objects}))
+            ran = commands.here(f"of_{len(objects)}", "eval", "solver.iterations=1")
+            assert ("best.ckpt was trained on other objects than these; checkpoint=..." in ran.err) == warned
+            assert "(of the latest training run; checkpoint=... for others)" in ran.out
+    finally:
+        shutil.rmtree(latest.parents[1])
+
+
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import inspect
+import json
 import logging
 import platform
 import subprocess
@@ -36,6 +37,7 @@ from lp_framework.solvers.base import Solver
 
 log = logging.getLogger(__name__)
 
+TRAINING = "training.json"  # what a training run says of itself
 DIVIDED = "model_parallel"  # the strategy that divides a prior among processes; Lightning has no name for it
 if DIVIDED not in StrategyRegistry.available_strategies():
     StrategyRegistry.register(DIVIDED, ModelParallelStrategy, description="a prior divided among the processes")
@@ -112,6 +114,16 @@ def warn_of_unused(config: DictConfig) -> None:
     for key, component in (("prior", "prior"), ("checkpoint", "model")):
         if key in named and component not in wanted and job.mode != RunMode.MULTIRUN:
             log.warning("%s=... has no effect: solver=%s takes no %s", key, name, component)
+
+
+def warn_of_other_objects(checkpoint: Path, names: Sequence[str]) -> None:
+    """Of a model that nobody chose: say so where it was trained on none of these objects."""
+    try:
+        trained = json.loads((checkpoint.parents[1] / TRAINING).read_text(encoding="utf-8"))["objects"]
+    except (OSError, ValueError, LookupError, TypeError):  # the one that ships, or a run that was stopped
+        return
+    if isinstance(trained, list) and not {*names} & {*map(str, trained)}:
+        log.warning("%s was trained on other objects than these; checkpoint=... chooses another model", checkpoint)
 
 
 def model_origin(checkpoint: Path, chosen: object) -> str:

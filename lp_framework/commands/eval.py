@@ -29,6 +29,7 @@ from lp_framework.commands.building import (
     run_folder,
     seed_run,
     versions,
+    warn_of_other_objects,
     warn_of_unused,
     weights_fingerprint,
 )
@@ -78,6 +79,8 @@ def run(config: DictConfig) -> None:
     trainer = build_trainer(config, folder, [RichProgressBar(leave=False)], logger=[])
     evaluation = build_evaluation(config, solver, data, journal)
     trainer.test(evaluation, datamodule=data, verbose=False)
+    if checkpoint is not None and config.checkpoint is None:
+        warn_of_other_objects(checkpoint, evaluation.table.names)
     evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather
     result = {
         **evaluation.result(),

@@ -29,6 +29,7 @@ from yaml import YAMLError
 from lp_framework import registry
 from lp_framework.commands.building import (
     DIVIDED,
+    TRAINING,
     build_data,
     build_trainer,
     orderly_console,
@@ -48,7 +49,6 @@ from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.pictures import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
-REPORT = "training.json"
 # Of Lightning's entries in a checkpoint, those without which no training goes on.
 TRAINING_STATE = {"epoch": int, "global_step": int, "loops": dict, "optimizer_states": list, "lr_schedulers": list}
 
@@ -156,7 +156,7 @@ def _training_state(file: Path) -> dict[str, Any]:
 def is_finished(folder: Path, config: DictConfig, checkpoint: Mapping[str, Any]) -> bool:
     """Whether the run of a checkpoint has nothing left to do, its report included."""
     epochs = config.trainer.max_epochs
-    return epochs is not None and 0 <= epochs <= checkpoint["epoch"] + 1 and (folder / REPORT).is_file()
+    return epochs is not None and 0 <= epochs <= checkpoint["epoch"] + 1 and (folder / TRAINING).is_file()
 
 
 def callbacks(config: DictConfig, folder: Path, recipe: dict[str, Any]) -> list[Callback]:
@@ -209,11 +209,11 @@ def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
 
 
 def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any], data: PairDataModule) -> None:
-    """`REPORT` and the closing lines; the fingerprint is that of all training views."""
+    """`TRAINING` and the closing lines; the fingerprint is that of all training views."""
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
     write_json(
-        folder / REPORT,
+        folder / TRAINING,
         {**recipe, "seed": config.seed, "epochs": trainer.current_epoch, "steps": trainer.global_step,
          "final": losses, "objects": data.table("train").names,
          "fingerprints": {"views": data.fingerprint("all_train")}, "versions": versions()},
