@@ -129,7 +129,8 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
         registry.discover(config.get("plugins", []))
         environment = dict(os.environ)
         try:
-            if mistaken := _misplaced(str(job.job.config_name), str(job.runtime.choices.get("experiment"))):
+            experiment = job.runtime.choices.get("experiment")
+            if experiment and (mistaken := _misplaced(str(job.job.config_name), experiment)):
                 raise UsageError(mistaken)
             importlib.import_module(f"lp_framework.commands.{command}").run(config)
         except (UserError, MissingMandatoryValue, InterpolationResolutionError) as error:
@@ -249,12 +250,12 @@ def _wrong_experiment(command: str, message: str) -> str | None:
 
 def _misplaced(command: str, experiment: str) -> str | None:
     """A sentence where an experiment goes with other commands and not with this one; a config of your own has all."""
-    if command not in COMMANDS:
+    if command not in COMMANDS or experiment in (own := experiments(command)):
         return None
     others = [each for each in COMMANDS if (conf_dir() / f"{each}.yaml").is_file() and experiment in experiments(each)]
-    if not others or command in others:
+    if not others:
         return None
-    known = _known(experiments(command))
+    known = _known(own)
     return f"experiment={experiment}: is none of {command}'s ({known}); it goes with {' or '.join(others)}"
 
 

@@ -86,22 +86,28 @@ class Precision:
         figures: list[Figure] = []
         record: dict[str, Any] = {}
         for number, (words, variant) in enumerate(variants.items()):
-            prior = self.prior(networks, variant)
-            runner = Batched(PairEnergy(prior, pair, 0, codes), starts)
-            memory = self.memory(runner, prior)
-            off = deviation(gradient(runner), exact)
-            theirs = Contender(runner, Arithmetic(operations, peak(self.device, DTYPES[variant.dtype])), memory)
-            note += f"; {words}: gradient off by {off:.1g}, the device's peak {theirs.arithmetic.peak}"
-            for section in self.against(words, theirs, ours):
-                entry = {words: {**section.record, "gradient_deviation": off}} if section.record else {}
-                done = (number + section.done) / len(variants)
-                yield Section(title, (VARIANT, PLAIN), [*figures, *section.figures], {**record, **entry}, done, note)
-            note += halved(prior, self.max_batch)
-            figures += section.figures
-            record |= entry
+            for section in self.against(words, self.prior(networks, variant), DTYPES[variant.dtype], ours, exact):
+                entry = {words: section.record} if section.record else {}
+                yield Section(
+                    title,
+                    (VARIANT, PLAIN),
+                    [*figures, *section.figures],
+                    {**record, **entry},
+                    (number + section.done) / len(variants),
+                    note + section.note,
+                )
+            figures, record, note = [*figures, *section.figures], {**record, **entry}, note + section.note
 
-    def against(self, words: str, theirs: Contender, ours: Contender) -> Iterator[Section]:
-        """A variant's section."""
+    def against(
+        self, words: str, prior: Zero123Prior, dtype: torch.dtype, ours: Contender, exact: torch.Tensor
+    ) -> Iterator[Section]:
+        """A variant's section; `exact` is the gradient `[1, N, 3]` in plain float32. Its U-Net is gone afterwards."""
+        plain = ours.runner.energy
+        starts = Ring(self.starts).make(plain.pairs.ids, seed=0)
+        runner = Batched(PairEnergy(prior, plain.pairs, plain.seed, plain.codes), starts)
+        memory = self.memory(runner, prior)
+        off = deviation(gradient(runner), exact)
+        theirs = Contender(runner, Arithmetic(ours.arithmetic.operations, peak(self.device, dtype)), memory)
         both = {VARIANT: theirs, PLAIN: ours}
         match = Match(words, f"{words}: seconds a step", self.work(theirs.runner), self.work(ours.runner), rate=False)
         for section in compete("", (VARIANT, PLAIN), [match], self.rounds, self.device):
@@ -116,12 +122,14 @@ class Precision:
                     "seconds_per_step": section.record[words],
                     "arithmetic": {name: each.arithmetic.record() for name, each in both.items()},
                     "share_of_peak": dict(zip(both, shares, strict=True)),
+                    "gradient_deviation": off,
                 }
                 if ours.peak_bytes:
                     gigabytes = (each.peak_bytes / 1e9 for each in both.values())
                     figures.append(Figure(f"{words}: peak memory, GB", *gigabytes))
                     record["peak_bytes"] = {name: each.peak_bytes for name, each in both.items()}
-            yield replace(section, figures=figures, record=record)
+            note = f"; {words}: gradient off by {off:.1g}, the device's peak {theirs.arithmetic.peak}"
+            yield replace(section, figures=figures, record=record, note=note + halved(prior, self.max_batch))
 
     def memory(self, runner: Batched, prior: Zero123Prior) -> int:
         """Bytes of the first step, on a GPU, and of the U-Net's weights: once recorded a step takes no more."""

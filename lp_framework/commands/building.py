@@ -130,11 +130,8 @@ def model_origin(checkpoint: Path, chosen: object) -> str:
     """Which model a solver has, for the terminal; `chosen` is the config's `checkpoint`."""
     if checkpoint.is_relative_to(SHIPPED):
         return "the one that ships"
-    return (
-        str(checkpoint)
-        if chosen is not None
-        else f"{checkpoint} (of the latest training run; checkpoint=... for others)"
-    )
+    found = "" if chosen is not None else " (of the latest training run; checkpoint=... for others)"
+    return f"{checkpoint}{found}"
 
 
 def seed_run(seed: object) -> None:
