@@ -1,4 +1,4 @@
-"""Estimating poses of pictures: what `lp_framework.estimate_pose` and the command `estimate` share."""
+"""The Python API, which `lp_framework` exports, and what it shares with the commands on photographs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike
 from PIL import Image
 from torch import Tensor
 
-import lp_framework
-from lp_framework import registry
+from lp_framework import catalogue, registry
 from lp_framework.data.pairs import as_images
 from lp_framework.data.photographs import BackgroundRemover, array_image, on_white, prepare, read_image, upright
 from lp_framework.errors import UserError
+from lp_framework.models.checkpoints import load_model as read_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.base import Solution, Solver, ViewSets
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.solvers.starts import Starts
 
@@ -38,7 +38,17 @@ def estimate_pose(
     crop: bool = True,
     remove_background: bool = False,
 ) -> Solution:
-    """See `lp_framework.estimate_pose`."""
+    """The pose of `query` relative to `reference`, two pictures of one object; `.answer()` of the result is `[1, 3]`:
+    latitude and longitude (radians, the latter in [0, 2 pi)) and radius (object sizes), query minus reference.
+
+    A picture is a file, an image of Pillow or an array `[H, W, 3 | 4]` (uint8, or floats in [0, 1]). It is prepared as
+    `data.photographs` says: cut out by its alpha channel, or by rembg with `remove_background`, centred and scaled.
+    With `crop=False` it is a whole square view, on white where it has no alpha channel.
+
+    `solver`, `prior` and `starts` are registered names or objects built by the functions below. A solver by name gets
+    the prior and the model that it asks for (`model` is a checkpoint, a run's folder, or a model; None: the one that
+    ships) on the GPU, where there is one; a built solver has its own.
+    """
     remover = BackgroundRemover() if remove_background else None
     prepared = [
         prepare(open_picture(picture, name), name, remover=remover, crop=crop)
@@ -48,24 +58,59 @@ def estimate_pose(
         solver = _build_solver(solver, prior, model)
         move(solver, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
     device = next((each.device for part in solver.networks() for each in part.parameters()), torch.device("cpu"))
-    index = torch.arange(2, device=device)
-    pairs = Pairs(image_batch(prepared).to(device), index[:1], index[1:], ids=index[:1])
-    starting = registry.build("start", starts) if isinstance(starts, str) else starts
+    pairs = view_set(prepared, device).pairs([0], [1])
+    starting = make_starts(starts) if isinstance(starts, str) else starts
     with shown_progress():
         return solver.solve(pairs, starting.make(pairs.ids, seed), seed)
 
 
+def load_model(checkpoint: str | Path | None = None) -> PoseModel:
+    """The trained model of a checkpoint file, of a training run's folder, or that ships under a name; None: "score".
+
+    Raises `UserError` where there is none.
+    """
+    return read_model("score" if checkpoint is None else checkpoint)
+
+
+def load_prior(name: str, **arguments: Any) -> Prior:
+    """A pose-conditioned diffusion prior by the name of a choice of `prior=`, frozen."""
+    prior: Prior = registry.build("prior", _settings("prior", name, arguments))
+    return prior
+
+
+def load_solver(name: str, model: PoseModel | None = None, prior: Prior | None = None, **arguments: Any) -> Solver:
+    """A solver by the name of a choice of `solver=`, with the model and the prior that it asks for and its settings."""
+    solver: Solver = registry.build("solver", _settings("solver", name, arguments), model=model, prior=prior)
+    return solver
+
+
+def make_starts(name: str, **arguments: Any) -> Starts:
+    """Starts by the name of a choice of `start=`; `.make(ids, seed)` gives `[B, N, 3]` relative poses."""
+    starts: Starts = registry.build("start", _settings("start", name, arguments))
+    return starts
+
+
+def _settings(group: str, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a registered name or of a preset in `conf/`, with those given over them."""
+    preset = {"name": name} if name in registry.names(group) else catalogue.values(group, name)
+    return {**preset, **arguments}
+
+
 def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel | None) -> Solver:
-    wanted = registry.component_names(registry.get("solver", name))
+    settings = _settings("solver", name, {})
+    wanted = registry.component_names(registry.get("solver", settings["name"]))
     components: dict[str, Any] = {}
     if "model" in wanted:
-        components["model"] = model if isinstance(model, PoseModel) else lp_framework.load_model(model)
+        components["model"] = model if isinstance(model, PoseModel) else load_model(model)
     if "prior" in wanted:
-        components["prior"] = prior if isinstance(prior, Prior) else registry.build("prior", prior)
+        components["prior"] = prior if isinstance(prior, Prior) else load_prior(prior)
         if prior == "tiny":
-            warnings.warn(f"{TINY_KNOWS}. For photographs take load_prior('zero123xl', path=...)", stacklevel=4)
-    solver: Solver = registry.build("solver", name, **components)
+            warnings.warn(f"{TINY_KNOWS}. For photographs take load_prior('zero123xl', path=...)", stacklevel=3)
+    solver: Solver = registry.build("solver", settings, **components)
     return solver
+
+
+# ---------------------------------------------------------------- photographs as views
 
 
 def _name(picture: object, otherwise: str) -> str:
@@ -87,6 +132,12 @@ def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Im
 def image_batch(prepared: Sequence[Image.Image]) -> Tensor:
     """Images `[I, 3, H, W]` in [-1, 1], on white, of prepared ones (RGBA, all of one size)."""
     return as_images(torch.from_numpy(np.stack([on_white(image) for image in prepared])))
+
+
+def view_set(prepared: Sequence[Image.Image], device: torch.device) -> ViewSets:
+    """The prepared photographs of one object as the one set of views to solve."""
+    views = torch.arange(len(prepared), device=device)[None]
+    return ViewSets(image_batch(prepared).to(device), views, ids=torch.zeros_like(views[:, 0]))
 
 
 def move(solver: Solver, device: torch.device) -> None:

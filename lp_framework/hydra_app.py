@@ -1,4 +1,4 @@
-"""A command as a Hydra application, and what goes wrong in it told in one sentence."""
+"""A command as a Hydra application, and what goes wrong in it explained in one sentence."""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ import difflib
 import importlib
 import logging
 import os
-import re
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
-from hydra._internal.utils import get_args_parser
+from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import (
@@ -29,32 +26,32 @@ from omegaconf.errors import (
     MissingMandatoryValue,
     OmegaConfBaseException,
 )
-from yaml import YAMLError
 
-from lp_framework import registry
-from lp_framework.cli import COMMANDS
-from lp_framework.composition import RegistrySearchPath, RegistrySource, conf_dir, experiments, group_names, one_line
-from lp_framework.errors import UserError, nearest
+from lp_framework import catalogue, registry
+from lp_framework.errors import UserError, nearest, one_line
 
 log = logging.getLogger(__name__)
 
-OPTIONS = (  # Hydra's
-    *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--resolve", "--package", "-p", "--run", "-r"),
-    *("--multirun", "-m", "--shell-completion", "-sc", "--config-path", "-cp", "--config-name", "-cn"),
-    *("--config-dir", "-cd", "--experimental-rerun", "--info", "-i"),
-)
-WITH_VALUE = (
-    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
-    *("--experimental-rerun", "--info", "-i"),
-)
+OPTIONS: dict[tuple[str, ...], dict[str, Any]] = {  # Hydra's, as argparse takes them
+    ("--help", "-h"): {"action": "store_true"},
+    ("--hydra-help",): {"action": "store_true"},
+    ("--version",): {"action": "store_true"},
+    ("--cfg", "-c"): {"choices": ["job", "hydra", "all"]},
+    ("--resolve",): {"action": "store_true"},
+    ("--package", "-p"): {},
+    ("--run", "-r"): {"action": "store_true"},
+    ("--multirun", "-m"): {"action": "store_true"},
+    ("--config-path", "-cp"): {},
+    ("--config-name", "-cn"): {},
+    ("--config-dir", "-cd"): {},
+    ("--info", "-i"): {"nargs": "?", "const": "all"},
+}
+CONFIG_OPTIONS = ("config_dir", "config_path", "config_name")
 LAUNCHER = "hydra/launcher/"
 LAUNCHERS = {  # those of Hydra's plugins, with the extra that brings each
     **{"joblib": "sweeps", "submitit_local": "sweeps", "submitit_slurm": "sweeps"},
     **{"ray": "ray", "ray_aws": "ray"},
 }
-COMPOSING = ("hydra._internal.config_loader_impl", "hydra.core.override_parser.overrides_parser")  # modules of Hydra
-SHOWING = ("show_cfg", "show_info")  # functions of Hydra
-HYDRA_VALUE_ERRORS = ("Config group override must be", "Only one of --run", "The --resolve flag")
 
 
 class UsageError(UserError):
@@ -67,44 +64,83 @@ def run(command: str, arguments: Sequence[str]) -> None:
     The command is `lp_framework.commands.COMMAND.run(config)`, imported only when it runs. Raises `UsageError` for
     arguments that do not compose, `UserError` for bad input met while running; in a sweep the other jobs go on first.
     """
-    arguments = _overrides_first(arguments)
-    options = _options(arguments)
+    overrides, options = _parse(arguments)
     try:
-        registry.discover(_plugin_folders(arguments))
+        registry.discover(_plugin_folders(overrides))
     except HydraException as error:
-        raise UsageError(_explain(error)) from error
-    for origin, failure in registry.failures().items():
-        print(f"warning: plugin {origin} could not be loaded: {failure}", file=sys.stderr)
-    RegistrySearchPath.config_dir = options.get("--config-dir")
-    Plugins.instance().register(RegistrySource)
-    Plugins.instance().register(RegistrySearchPath)
+        raise UsageError(explain(error)) from error
+    for source, failure in registry.failures().items():
+        print(f"warning: plugin {source} could not be loaded: {failure}", file=sys.stderr)
+    if options["help"]:
+        print(catalogue.command_help(options["config_name"] or command, overrides, options["config_dir"]))
+        return
+    _store_plugin_configs()
+    if options["config_name"] is None:
+        _check_experiment(command, overrides)
+    options_line = [word for action, value in options.items() for word in _as_words(action, value)]
+    own = [word for action in CONFIG_OPTIONS for word in _as_words(action, options[action])]
     failed: list[UserError] = []
-    task = _task(command, [each for pair in options.items() for each in pair], failed)
     try:
-        with _set_up_for_hydra(arguments):
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command)(task)()
-    except ConfigCompositionException as error:
-        name = options.get("--config-name", command)
-        raise UsageError(_wrong_experiment(name, str(error)) or _explain(error)) from error
-    except (HydraException, YAMLError, MissingMandatoryValue, InterpolationResolutionError) as error:
-        raise UsageError(_explain(error)) from error
+        with _as_hydra_wants_it([*overrides, *options_line]):
+            task = _task(command, own, failed)
+            hydra.main(version_base="1.3", config_path=str(registry.conf_dir()), config_name=command)(task)()
     except UserError:
         raise
     except Exception as error:
-        if str(error).startswith(HYDRA_VALUE_ERRORS):
-            raise UsageError(one_line(error)) from error
-        if isinstance(error, OSError) and not _in_a_job(error):
-            raise UsageError(f"this run's folder cannot be made: {one_line(error)}") from error
-        if _while_composing(error):
-            raise UsageError(f"this makes no configuration ({type(error).__name__}: {one_line(error)})") from error
-        raise
+        if getattr(error, "raised_by_a_command", False):
+            raise
+        if isinstance(error, OSError) and not isinstance(error, HydraException):
+            raise UsageError(f"the folder of this run cannot be made: {one_line(error)}") from error
+        raise UsageError(explain(error)) from error
     if failed:
         raise failed[0]
 
 
+def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Callable[[DictConfig], None]:
+    """What Hydra calls with the composed config of each job."""
+
+    def task(config: DictConfig) -> None:
+        job = HydraConfig.get()
+        sweep = job.mode == RunMode.MULTIRUN
+        # The command line that starts this job alone: Lightning runs it for its other processes.
+        own = [override for override in job.overrides.hydra if not override.startswith("hydra.mode=")]
+        own += ["hydra.mode=RUN"] if sweep else []  # an experiment may ask for a sweep
+        sys.argv = [sys.argv[0], command, *options, *own, *job.overrides.task]
+        registry.discover(_as_list(config.get("plugins", [])))
+        environment = dict(os.environ)
+        try:
+            importlib.import_module(f"lp_framework.commands.{command}").run(config)
+        except (UserError, MissingMandatoryValue, InterpolationResolutionError) as error:
+            mistake = error if isinstance(error, UserError) else UserError(explain(error))
+            if sweep:
+                log.error("job %s (%s): %s", job.job.num, ", ".join(job.overrides.task), mistake)
+                raise mistake from error
+            log.info("stopped: %s", mistake)  # for the log; the console gets it from the caller
+            failed.append(mistake)
+        except Exception as error:
+            log.log(logging.ERROR if sweep else logging.INFO, "%s failed", command, exc_info=True)
+            error.raised_by_a_command = True  # type: ignore[attr-defined]  # also after it was pickled by a launcher
+            raise
+        finally:
+            _leave_processes()
+            if sweep:  # the next job would take what Lightning leaves of this one's processes for its own
+                os.environ.clear()
+                os.environ.update(environment)
+
+    task.__module__ = f"lp_framework.commands.{command}"  # gives the job its name
+    return task
+
+
+def _leave_processes() -> None:
+    """Leave the process group of a job with several processes: its threads would block the end of this one."""
+    distributed = sys.modules.get("torch.distributed")
+    if distributed is not None and distributed.is_available() and distributed.is_initialized():
+        distributed.destroy_process_group()
+
+
 @contextmanager
-def _set_up_for_hydra(arguments: Sequence[str]) -> Iterator[None]:
-    """The arguments where Hydra looks for them, and exceptions let through instead of printed."""
+def _as_hydra_wants_it(arguments: Sequence[str]) -> Iterator[None]:
+    """The arguments where Hydra reads them, and exceptions passed on instead of printed."""
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv = [argv[0], *arguments]
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -118,104 +154,74 @@ def _set_up_for_hydra(arguments: Sequence[str]) -> Iterator[None]:
             os.environ["HYDRA_FULL_ERROR"] = full_error
 
 
-def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Callable[[DictConfig], None]:
-    def task(config: DictConfig) -> None:
-        job = HydraConfig.get()
-        sweep = job.mode == RunMode.MULTIRUN
-        # What starts this very job again, and it alone: Lightning runs it for its other processes.
-        own = [override for override in job.overrides.hydra if not override.startswith("hydra.mode=")]
-        own += ["hydra.mode=RUN"] if sweep else []  # an experiment may ask for a sweep
-        sys.argv = [sys.argv[0], command, *options, *own, *job.overrides.task]
-        registry.discover(config.get("plugins", []))
-        environment = dict(os.environ)
-        try:
-            experiment = job.runtime.choices.get("experiment")
-            if experiment and (mistaken := _misplaced(str(job.job.config_name), experiment)):
-                raise UsageError(mistaken)
-            importlib.import_module(f"lp_framework.commands.{command}").run(config)
-        except (UserError, MissingMandatoryValue, InterpolationResolutionError) as error:
-            mistake = error if isinstance(error, UserError) else UserError(_explain(error))
-            if sweep:
-                log.error("job %s (%s): %s", job.job.num, ", ".join(job.overrides.task), mistake)
-                raise mistake from error
-            log.info("stopped: %s", mistake)  # for the log; the console gets it from the caller
-            failed.append(mistake)
-        except Exception:
-            log.log(logging.ERROR if sweep else logging.INFO, "%s failed", command, exc_info=True)
-            raise
-        finally:
-            _leave_processes()
-            if sweep:  # the next job would take what Lightning leaves of this one's processes for its own
-                os.environ.clear()
-                os.environ.update(environment)
-
-    task.__module__ = f"lp_framework.commands.{command}"  # gives the job its name
-    return task
+def _store_plugin_configs() -> None:
+    """Give Hydra the configs of plugins; a file with a mistake is named, and the others are there."""
+    store = ConfigStore.instance()
+    for each in catalogue.plugin_nodes():
+        if isinstance(each, str):
+            print(f"warning: a plugin's configuration is left out: {each}", file=sys.stderr)
+        else:
+            store.store(each.name, each.values, group=each.group, package=each.package, provider="plugin")
 
 
-def _leave_processes() -> None:
-    """End what a job's several processes speak by: its threads do not survive being cut off when this one ends."""
-    distributed = sys.modules.get("torch.distributed")
-    if distributed is not None and distributed.is_available() and distributed.is_initialized():
-        distributed.destroy_process_group()
+# ---------------------------------------------------------------- the command line
 
 
-def _in_a_job(error: Exception) -> bool:
-    """Whether an exception comes from a command, and not from Hydra before or after it."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return any(frame.f_globals.get("__name__") == __name__ and frame.f_code.co_name == "task" for frame in frames)
-
-
-def _while_composing(error: Exception) -> bool:
-    """Whether an exception comes from Hydra's composing or showing a configuration, and not from a job."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return any(frame.f_globals.get("__name__") in COMPOSING or frame.f_code.co_name in SHOWING for frame in frames)
-
-
-def _options(arguments: Sequence[str]) -> dict[str, str]:
-    """Those of Hydra's options that say where configs are; `UsageError` for a misspelt option."""
+def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """The overrides and Hydra's options, in any order; `UsageError` for an option that does not exist."""
+    known = [name for names in OPTIONS for name in names]
     for argument in arguments:
         option = argument.partition("=")[0]
-        if option.startswith("-") and option not in OPTIONS:
-            raise UsageError(f"there is no option '{option}'{nearest(option, OPTIONS)}")
-    hydras = get_args_parser()
-    hydras.error = _usage  # type: ignore[method-assign]  # instead of a page and an exit
-    hydras.parse_args([argument for argument in arguments if argument != "--version"])
+        if option.startswith("-") and option not in known:
+            raise UsageError(f"there is no option '{option}'{nearest(option, known)}")
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config-dir", "-cd")
-    parser.add_argument("--config-path", "-cp")
-    parser.add_argument("--config-name", "-cn")
-    known = vars(parser.parse_known_args(arguments)[0])
-    return {f"--{key.replace('_', '-')}": value for key, value in known.items() if value is not None}
+    parser.error = _usage  # type: ignore[method-assign]  # a sentence instead of a page and an exit
+    for names, settings in OPTIONS.items():
+        parser.add_argument(*names, **settings)
+    options, overrides = parser.parse_known_args(arguments)
+    return overrides, vars(options)
 
 
 def _usage(message: str) -> NoReturn:
     raise UsageError(f"{message} (--help shows the options)")
 
 
-def _overrides_first(arguments: Sequence[str]) -> list[str]:
-    """The arguments with Hydra's options behind the overrides: its parser wants all overrides in one piece."""
-    overrides: list[str] = []
-    options: list[str] = []
-    for before, argument in zip(["", *arguments], arguments, strict=False):
-        value = before in WITH_VALUE and ("=" not in argument or before not in ("--info", "-i"))
-        (options if argument.startswith("-") or value else overrides).append(argument)
-    return [*overrides, *options]
+def _as_words(action: str, value: object) -> list[str]:
+    """An option as words of a command line."""
+    name = f"--{action.replace('_', '-')}"
+    return [] if value in (None, False) else [name] if value is True else [name, str(value)]
 
 
-def _plugin_folders(arguments: Sequence[str]) -> list[str]:
+def _plugin_folders(overrides: Sequence[str]) -> list[str]:
     """The value of `plugins=[FOLDER, ...]`: plugins bring choices, so they are loaded before Hydra composes."""
-    for argument in reversed(arguments):
-        if argument.startswith("plugins="):
-            value = OverridesParser.create().parse_override(argument).value()
-            return list(map(str, value)) if isinstance(value, list) else [str(value)]
+    for override in reversed(overrides):
+        if override.startswith("plugins="):
+            return _as_list(OverridesParser.create().parse_override(override).value())
     return []
+
+
+def _as_list(value: Any) -> list[str]:
+    return [str(value)] if isinstance(value, str | int | float) else list(map(str, value or ()))
+
+
+def _check_experiment(command: str, overrides: Sequence[str]) -> None:
+    """`UsageError` for an experiment that belongs to other commands."""
+    chosen = [override.partition("=")[2] for override in overrides if override.startswith("experiment=")]
+    for experiment in chosen[-1:]:
+        own = catalogue.experiments(command)
+        commands = [file.stem for file in registry.conf_dir().glob("*.yaml")]
+        others = sorted(each for each in commands if experiment in catalogue.experiments(each))
+        if experiment not in own and others:
+            raise UsageError(
+                f"experiment={experiment} belongs to {' and '.join(others)}, not to {command} ({_known(own)})"
+            )
 
 
 # ---------------------------------------------------------------- errors in one sentence
 
 
-def _explain(error: Exception) -> str:
+def explain(error: Exception) -> str:
+    """What to tell a user of an error that Hydra or OmegaConf raised."""
     cause = error.__cause__ or error.__context__
     match error:
         case MissingConfigException(missing_cfg_file=str(file)) if file.removeprefix(LAUNCHER) in LAUNCHERS:
@@ -237,26 +243,9 @@ def _explain(error: Exception) -> str:
         case HydraException() if str(error).startswith("Ambiguous value for argument"):
             override = str(error).split("'")[1]
             key, _, values = override.partition("=")
-            as_list = "" if key in group_names() else f", or write a list, {key}=[{values}]"
+            as_list = "" if key in catalogue.groups() else f", or write a list, {key}=[{values}]"
             return f"'{override}' has several values: add --multirun to run each{as_list}"
-    return one_line(error)
-
-
-def _wrong_experiment(command: str, message: str) -> str | None:
-    """What to say where an experiment does not compose since it is another command's."""
-    found = re.match(r"In 'experiment/(.+?)': ", message)
-    return found and _misplaced(command, found[1])
-
-
-def _misplaced(command: str, experiment: str) -> str | None:
-    """A sentence where an experiment goes with other commands and not with this one; a config of your own has all."""
-    if command not in COMMANDS or experiment in (own := experiments(command)):
-        return None
-    others = [each for each in COMMANDS if (conf_dir() / f"{each}.yaml").is_file() and experiment in experiments(each)]
-    if not others:
-        return None
-    known = _known(own)
-    return f"experiment={experiment}: is none of {command}'s ({known}); it goes with {' or '.join(others)}"
+    return one_line(error) or type(error).__name__
 
 
 def _place(error: Exception) -> str:
@@ -272,11 +261,19 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     if parent:
         close = [f"{parent}.{each}" for each in difflib.get_close_matches(name, siblings, n=1, cutoff=0.5)]
     else:
-        siblings = sorted({*siblings, *group_names()} - {"hydra"})
-        inside = [f"{each}.{name}" for each in siblings if name in (error.parent_node.get(each) or ())]
+        siblings = sorted({*siblings, *catalogue.groups()} - {"hydra"})
+        inside = [f"{each}.{name}" for each in siblings if _has(error.parent_node, each, name)]
         close = inside or difflib.get_close_matches(name, siblings, n=1, cutoff=0.5)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     return f"{key}: {parent or 'the configuration'} has no '{name}'{hint} ({_known(siblings)})"
+
+
+def _has(config: Any, key: str, name: str) -> bool:
+    """Whether a config has a mapping `key` with an entry `name`; a value may be missing (`???`) or anything else."""
+    try:
+        return name in config[key]
+    except (OmegaConfBaseException, TypeError):
+        return False
 
 
 def _known(names: Sequence[str]) -> str:

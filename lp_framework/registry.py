@@ -1,19 +1,19 @@
 """Names to classes: `@register("solver", "langevin")` makes a class choosable as `solver=langevin`.
 
-The typed arguments of a class's constructor are its settings and the first line of its docstring its description. An
-argument that bears the name of a group (`prior`, `model`, `backbone`, ...) is a *component*: an object of that group
-that the caller builds and hands over, never a setting.
+The typed arguments of a class's constructor are its settings. An argument that bears the name of a group (`prior`,
+`model`, `backbone`, ...) is a *component*: an object of that group that the caller builds and passes, never a setting.
 
-Where classes come from:
+Classes come from three places:
 
-- *built-in*: the sources of this package are read, not run; a module is imported when one of its classes is asked for;
+- *built-in*: the packages of `GROUPS`, imported when a class of the group is asked for; `conf/GROUP/NAME.yaml` holds
+  the settings of each;
 - *packages* with an entry point in the group `lp_framework.plugins`, whose value is a module to import;
 - *folders*: `plugins/` of the working directory and those given to `discover`. A folder that holds Python files or a
-  pyproject.toml is one plugin; any other folder is looked through for plugins, one level down.
+  pyproject.toml is one plugin; any other folder is searched for plugins one level down.
 
 A plugin's modules are imported under their own names, with its folder at the end of `sys.path`, so that worker
-processes can unpickle its classes. A plugin that fails is kept in `failures()` with its error, and the rest load.
-A `conf/` folder beside a module of a plugin (inside it, if it is a package) is listed in `conf_folders()`.
+processes can unpickle its classes. A plugin that fails to import is kept in `failures()` with its error, and the rest
+load. A `conf/` folder beside a module of a plugin (inside it, if it is a package) is listed in `conf_folders()`.
 """
 
 from __future__ import annotations
@@ -22,38 +22,34 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
-import numbers
-import re
+import json
 import sys
-import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 from lp_framework.errors import UserError, nearest
-from lp_framework.registry_sources import BUILT_IN, GROUPS, PACKAGE, Argument, Entry, Key, built_ins, first_line
 
-__all__ = [
-    "GROUPS",
-    "build",
-    "component_names",
-    "conf_folders",
-    "discover",
-    "entries",
-    "failures",
-    "get",
-    "names",
-    "plugin_folders",
-    "register",
-]
-
+GROUPS = {  # each with the packages whose import registers its built-in classes
+    "model": ("lp_framework.models", "lp_framework.priors"),  # a prior is trained as a model
+    "backbone": ("lp_framework.models",),
+    "prior": ("lp_framework.priors",),
+    "solver": ("lp_framework.solvers",),
+    "start": ("lp_framework.solvers",),
+    "data": ("lp_framework.data",),
+    "renderer": ("lp_framework.data",),
+    "figure": ("lp_framework.figures",),
+}
+PACKAGE = "lp_framework"
+BUILT_IN = "built-in"
 ENTRY_POINTS = "lp_framework.plugins"
 MISSING = "???"  # OmegaConf's mark of a value that has to be given
 
+Key = tuple[str, str]  # group, name
 _Class = TypeVar("_Class", bound=type)
 
 
@@ -61,16 +57,16 @@ _Class = TypeVar("_Class", bound=type)
 class _State:
     """What has been found so far."""
 
-    classes: dict[Key, type]
-    origins: dict[Key, str]
-    failures: dict[str, str]
-    conf_folders: list[Path]
-    seen: set[str]  # plugins already tried, by folder or entry point
-    folders: list[Path]  # those given to `discover`
+    classes: dict[Key, type] = field(default_factory=dict)
+    origins: dict[Key, str] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+    conf_folders: list[Path] = field(default_factory=list)
+    seen: set[str] = field(default_factory=set)  # plugins already tried, by folder or entry point
+    folders: list[Path] = field(default_factory=list)  # those given to `discover`
     loading: str | None = None  # origin of the plugin being imported
 
 
-_state = _State({}, {}, {}, [], set(), [])
+_state = _State()
 
 
 # ---------------------------------------------------------------- registering
@@ -79,18 +75,21 @@ _state = _State({}, {}, {}, [], set(), [])
 def register(group: str, name: str) -> Callable[[_Class], _Class]:
     """Class decorator: make the class choosable as `group=name`.
 
-    Raises `UserError` for an unknown group, and for a name that another class of the group has already.
+    Raises `UserError` for an unknown group, and for a name that another class of the group already has.
     """
     _check_group(group)
 
     def record(cls: _Class) -> _Class:
         built_in = cls.__module__.partition(".")[0] == PACKAGE
         origin = BUILT_IN if built_in else _state.loading or f"module {cls.__module__}"
-        other = _owner(group, name, scan=not built_in)
-        if other is not None and other[:2] != (cls.__module__, cls.__qualname__):
+        if not built_in and (conf_dir() / group / f"{name}.yaml").is_file():
+            raise UserError(f"{group} '{name}' of {origin} has the name of a built-in {group}; give it another name")
+        other = _state.classes.get((group, name), cls)
+        if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
             raise UserError(
-                f"{group} '{name}' is registered twice: by {other[0]}.{other[1]} ({other[2]}) and by "
-                f"{cls.__module__}.{cls.__qualname__} ({origin}); give one of them another name"
+                f"{group} '{name}' is registered twice: by {other.__module__}.{other.__qualname__} "
+                f"({_state.origins[group, name]}) and by {cls.__module__}.{cls.__qualname__} ({origin}); "
+                "give one of them another name"
             )
         _state.classes[group, name] = cls
         _state.origins[group, name] = origin
@@ -99,32 +98,26 @@ def register(group: str, name: str) -> Callable[[_Class], _Class]:
     return record
 
 
-def _owner(group: str, name: str, scan: bool) -> tuple[str, str, str] | None:
-    """Module, class and origin that have the name already; `scan` looks among built-ins not yet imported, too."""
-    if cls := _state.classes.get((group, name)):
-        return cls.__module__, cls.__qualname__, _state.origins[group, name]
-    entry = built_ins().get((group, name)) if scan else None
-    return (entry.module, entry.qualname, entry.origin) if entry else None
+def conf_dir() -> Path:
+    """The folder of the built-in configs: inside the package when installed, else beside it in the source tree."""
+    inside = Path(__file__).parent / "conf"
+    return inside if inside.is_dir() else Path(__file__).parents[1] / "conf"
 
 
 # ---------------------------------------------------------------- looking up
 
 
 def names(group: str) -> list[str]:
-    """The names of a group, sorted.
+    """The registered names of a group, sorted.
 
     >>> "score" in names("model")
     True
     """
     _check_group(group)
     discover()
-    return sorted(name for found, name in {*built_ins(), *_state.classes} if found == group)
-
-
-def entries(group: str | None = None) -> list[Entry]:
-    """Every registered class of a group, or of all groups, sorted by group and name; imports no built-in."""
-    groups = GROUPS if group is None else (group,)
-    return [_entry(each, name) for each in groups for name in names(each)]
+    for package in GROUPS[group]:
+        importlib.import_module(package)
+    return sorted(name for found, name in _state.classes if found == group)
 
 
 def get(group: str, name: str) -> type:
@@ -132,19 +125,13 @@ def get(group: str, name: str) -> type:
     known = names(group)
     if name not in known:
         raise UserError(f"there is no {group} '{name}'{nearest(name, known)} (known: {', '.join(known) or 'none'})")
-    if (group, name) not in _state.classes:
-        entry = built_ins()[group, name]
-        try:
-            module = importlib.import_module(entry.module)
-        except ModuleNotFoundError as error:
-            if error.name is None or error.name.partition(".")[0] == PACKAGE:
-                raise
-            raise UserError(
-                f"{group} '{name}' needs the Python package '{error.name}', which is not installed: "
-                f"pip install '{_requirement(error.name)}'"
-            ) from error
-        return typing.cast(type, getattr(module, entry.qualname))
     return _state.classes[group, name]
+
+
+def plugin_classes() -> dict[Key, tuple[type, str]]:
+    """The classes that plugins have registered, by group and name, each with its origin."""
+    discover()
+    return {key: (cls, _state.origins[key]) for key, cls in _state.classes.items() if _state.origins[key] != BUILT_IN}
 
 
 def failures() -> dict[str, str]:
@@ -167,44 +154,44 @@ def plugin_folders() -> list[Path]:
 # ---------------------------------------------------------------- building
 
 
-def build(group: str, config: Mapping[str, Any] | str, **components: object) -> Any:
-    """An instance of the class that `config` names: `{"name": ..., setting: value, ...}`, or the name alone.
+def build(group: str, settings: Mapping[str, Any] | str, **components: object) -> Any:
+    """An instance of the class that `settings` names: `{"name": ..., setting: value, ...}`, or the name alone.
 
-    `components` are the objects at hand by group (`model=network, prior=prior`); the constructor gets those that it
-    declares. Raises `UserError` for an unknown name or setting, a setting without a value, a value that
-    does not fit its type, and a component that is needed and not at hand; what the constructor raises passes through.
+    `components` are the available objects by group (`model=network, prior=prior`); the constructor gets those that it
+    declares. Raises `UserError` for an unknown name or setting, a setting without a value, a value that does not fit
+    its type, and a component that is needed and missing; what the constructor raises passes through.
     """
-    settings = {"name": config} if isinstance(config, str) else _plain(config)
-    name = settings.pop("name", None)
+    values = {"name": settings} if isinstance(settings, str) else dict(settings)
+    name = values.pop("name", None)
     if not isinstance(name, str):
         raise UserError(f"the configuration of a {group} has no name: choose one with {group}=NAME")
     cls = get(group, name)
-    arguments, wanted = _parameters(cls)
-    for key in settings:
+    arguments, wanted = parameters(cls)
+    for key in values:
         if key not in arguments:
-            reason = "is handed over, it cannot be set there" if key in wanted else "is none of its settings"
+            reason = "is a component, not a setting" if key in wanted else "is not one of its settings"
             raise UserError(
                 f"{group} '{name}': '{key}' {reason}{nearest(key, arguments)} (known: {', '.join(arguments) or 'none'})"
             )
     for key, parameter in arguments.items():
-        value = settings.get(key, parameter.default)
+        value = values.get(key, parameter.default)
         if value is inspect.Parameter.empty or (isinstance(value, str) and value == MISSING):
             raise UserError(f"{group} '{name}' needs a value for '{key}': give {group}.{key}=VALUE")
-    _check_types(group, name, cls, settings)
-    handed = {key: components[key] for key in wanted if components.get(key) is not None}
+    values = checked(cls.__init__, values, f"{group} '{name}': ")  # type: ignore[misc]
+    passed = {key: components[key] for key in wanted if components.get(key) is not None}
     for key, parameter in wanted.items():
-        if key not in handed and parameter.default is inspect.Parameter.empty:
+        if key not in passed and parameter.default is inspect.Parameter.empty:
             raise UserError(f"{group} '{name}' needs a {key}: choose one with {key}=NAME")
-    return cls(**settings, **handed)
+    return cls(**values, **passed)
 
 
 def component_names(cls: type) -> list[str]:
     """The components that a class's constructor declares, that is its arguments named after a group."""
-    return list(_parameters(cls)[1])
+    return list(parameters(cls)[1])
 
 
-def _parameters(cls: type) -> tuple[dict[str, inspect.Parameter], dict[str, inspect.Parameter]]:
-    """The constructor's settings and components, by name."""
+def parameters(cls: type) -> tuple[dict[str, inspect.Parameter], dict[str, inspect.Parameter]]:
+    """The settings and the components of a class's constructor, by name."""
     named = {
         key: parameter
         for key, parameter in inspect.signature(cls).parameters.items()
@@ -214,66 +201,35 @@ def _parameters(cls: type) -> tuple[dict[str, inspect.Parameter], dict[str, insp
     return settings, {key: value for key, value in named.items() if key in GROUPS}
 
 
-def _plain(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with OmegaConf's containers turned into dicts and lists, interpolations resolved."""
-    from omegaconf import OmegaConf
+def checked(function: Callable[..., Any], values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """The values as the function's type hints want them: a whole number for a float becomes one, a list a tuple.
 
-    def plain(value: Any) -> Any:
-        return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+    Raises `UserError` for a value that does not fit the hint of the argument of its name. Objects other than names and
+    numbers are passed on as they are.
+    """
+    from pydantic import TypeAdapter, ValidationError
+    from pydantic.errors import PydanticUserError
 
-    whole: Mapping[str, Any] = plain(config)
-    return {str(key): plain(value) for key, value in whole.items()}
-
-
-def _check_types(group: str, name: str, cls: type, settings: Mapping[str, Any]) -> None:
     try:
-        hints = typing.get_type_hints(cls.__init__)  # type: ignore[misc]
+        hints = typing.get_type_hints(function)
     except NameError:  # names that only a type checker imports
-        return
-    for key, value in settings.items():
+        return dict(values)
+    found = dict(values)
+    for key, value in values.items():
         hint = hints.get(key, Any)
-        if not fits(value, hint):
+        try:
+            # As JSON, in which a list fits a tuple and text fits a path; strictly, so that text never fits a number.
+            found[key] = TypeAdapter(hint).validate_json(json.dumps(value), strict=True)
+        except (TypeError, PydanticUserError):
+            continue
+        except ValidationError as error:
             if typing.get_origin(hint) is typing.Literal:
                 choices = list(map(str, typing.get_args(hint)))
-                reason = f"is none of its values{nearest(str(value), choices)} (known: {', '.join(choices)})"
+                expected = f"one of {', '.join(choices)}{nearest(str(value), choices)}"
             else:
-                reason = f"is not of its type, {inspect.formatannotation(hint).replace('collections.abc.', '')}"
-            raise UserError(f"{group} '{name}': {key}={value} {reason}")
-
-
-def fits(value: object, hint: Any) -> bool:
-    """Whether a plain value can be passed for a type hint; hints that are not of plain values take anything."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        return any(fits(value, each) for each in arguments)
-    if origin is typing.Literal:
-        return value in arguments
-    if origin in (list, tuple, Sequence):
-        if not isinstance(value, list | tuple):
-            return False
-        if origin is tuple and arguments[-1] is not Ellipsis:
-            return len(value) == len(arguments) and all(map(fits, value, arguments))
-        return all(fits(each, arguments[0]) for each in value)
-    if hint in (int, float):
-        kind = numbers.Integral if hint is int else numbers.Real
-        return isinstance(value, kind) and not isinstance(value, bool)
-    if hint is Path:
-        return isinstance(value, str | Path)
-    return isinstance(value, hint) if hint in (bool, str, type(None)) else True
-
-
-def _requirement(module: str) -> str:
-    """What pip has to install for a module: the extra of this package that brings it, or the module's own name."""
-    wanted = module.partition(".")[0].replace("_", "-").lower()
-    try:
-        requirements = importlib.metadata.requires(PACKAGE) or []
-    except importlib.metadata.PackageNotFoundError:
-        requirements = []
-    for requirement in requirements:
-        match = re.match(r"([\w.-]+).*;.*extra == ['\"]([\w-]+)", requirement)
-        if match and match[1].replace("_", "-").lower() == wanted:
-            return f"{PACKAGE}[{match[2]}]"
-    return wanted
+                expected = inspect.formatannotation(hint).replace("collections.abc.", "").replace("typing.", "")
+            raise UserError(f"{prefix}{key}={value} does not fit; expected {expected}") from error
+    return found
 
 
 # ---------------------------------------------------------------- discovery of plugins
@@ -289,7 +245,8 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
     for point in _entry_points():
         if _first_time(f"entry point {point.name}={point.value}"):
             package = f"{point.dist.name} {point.dist.version}" if point.dist else point.name
-            _load_entry_point(point.module, f"package {package}")
+            with _guarded(f"package {package}"):
+                _import(point.module)
     here = Path("plugins")
     if here.is_dir():
         _load_folder(here.resolve())
@@ -305,7 +262,7 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
 
 @cache
 def _entry_points() -> tuple[importlib.metadata.EntryPoint, ...]:
-    """Looked for once: that means to read the metadata of every package that is installed."""
+    """Cached, because it reads the metadata of every package that is installed."""
     return tuple(importlib.metadata.entry_points(group=ENTRY_POINTS))
 
 
@@ -314,14 +271,6 @@ def _first_time(plugin: str) -> bool:
         return False
     _state.seen.add(plugin)
     return True
-
-
-def _load_entry_point(module: str, origin: str) -> None:
-    with _guarded(origin):
-        importlib.import_module(module)
-        spec = importlib.util.find_spec(module)
-        if spec is not None and spec.origin is not None:
-            _add_conf(Path(spec.origin))
 
 
 def _load_folder(folder: Path) -> bool:
@@ -351,8 +300,7 @@ def _load_plugin(folder: Path) -> None:
             spec = importlib.util.find_spec(name)
             if spec is None or spec.origin is None or Path(spec.origin).resolve() != file:
                 raise ImportError(f"the name of its module '{name}' is taken by {spec.origin if spec else 'another'}")
-            importlib.import_module(name)
-            _add_conf(file)
+            _import(name)
 
 
 def _modules(folder: Path) -> dict[str, Path]:
@@ -368,53 +316,29 @@ def _modules(folder: Path) -> dict[str, Path]:
     }
 
 
-def _add_conf(module: Path) -> None:
-    folder = module.parent / "conf"
-    if folder.is_dir() and folder not in _state.conf_folders:
-        _state.conf_folders.append(folder)
+def _import(module: str) -> None:
+    file = importlib.import_module(module).__file__
+    conf = Path(file).parent / "conf" if file else None
+    if conf is not None and conf.is_dir() and conf not in _state.conf_folders:
+        _state.conf_folders.append(conf)
 
 
 @contextmanager
 def _guarded(origin: str) -> Iterator[None]:
-    """Import a plugin: what it registers gets `origin`; when it fails nothing of it stays but the error."""
+    """Import a plugin: what it registers gets `origin`; when it fails, nothing of it stays but the error."""
     classes, origins = dict(_state.classes), dict(_state.origins)
     _state.loading = origin
     try:
         yield
     except (Exception, SystemExit) as error:
-        _state.classes, _state.origins = classes, origins
+        built_in = {key for key, where in _state.origins.items() if where == BUILT_IN}
+        classes.update({key: _state.classes[key] for key in built_in})
+        _state.classes, _state.origins = classes, {**origins, **dict.fromkeys(built_in, BUILT_IN)}
         _state.failures[origin] = f"{type(error).__name__}: {error}"
     finally:
         _state.loading = None
 
 
-# ---------------------------------------------------------------- describing
-
-
 def _check_group(group: str) -> None:
     if group not in GROUPS:
         raise UserError(f"there is no group '{group}'{nearest(group, GROUPS)} (known: {', '.join(GROUPS)})")
-
-
-def _entry(group: str, name: str) -> Entry:
-    built_in = built_ins().get((group, name))
-    if built_in is not None:
-        return built_in
-    cls = _state.classes[group, name]
-    settings, components = _parameters(cls)
-    return Entry(
-        group,
-        name,
-        cls.__module__,
-        cls.__qualname__,
-        _state.origins[group, name],
-        first_line(cls.__doc__),
-        tuple(map(_argument, settings.values())),
-        tuple(map(_argument, components.values())),
-    )
-
-
-def _argument(parameter: inspect.Parameter) -> Argument:
-    empty = inspect.Parameter.empty
-    annotation = "" if parameter.annotation is empty else inspect.formatannotation(parameter.annotation).strip("'")
-    return Argument(parameter.name, annotation, None if parameter.default is empty else repr(parameter.default))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import os
 import subprocess
 import sys
@@ -13,15 +14,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hypothesis import settings
 
 from lp_framework import cli, registry, torchvision_ops
 
 torchvision_ops.install()
+Plugins.instance()  # Hydra stores the configs of its own plugins once, too
 torch.set_num_threads(1)  # as have processes that tests start, with whose numbers these are compared to the last bit
 # The same examples everywhere and always; `--hypothesis-profile=default` looks for new ones.
 settings.register_profile("same", derandomize=True, database=None, deadline=None)
 settings.load_profile("same")
+for group in registry.GROUPS:  # built-ins register once, whatever a test's clean registry forgets
+    for package in registry.GROUPS[group]:
+        importlib.import_module(package)
 ROOT = Path(__file__).parents[1]
 collect_ignore = ["pretended_device.py", "on_a_pretended_device.py"]  # they have a process of their own
 
@@ -47,6 +54,7 @@ def clean_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """What a test registers or discovers is forgotten after it."""
     before = set(sys.modules)
     monkeypatch.setattr(registry, "_state", copy.deepcopy(registry._state))
+    monkeypatch.setattr(ConfigStore.instance(), "repo", copy.deepcopy(ConfigStore.instance().repo))
     monkeypatch.setattr(sys, "path", list(sys.path))
     yield
     for name in set(sys.modules) - before:
@@ -146,13 +154,14 @@ def walker(tmp_path: Path, write: Callable[[str, str], Path]) -> Path:
     write(
         "configs/demo.yaml",
         """
+        # A demo of the help.
         defaults:
           - base
           - solver: walk
           - model: net
           - experiment: null
           - _self_
-        seed: 0
+        seed: 0 # of every draw
         """,
     )
     write("configs/experiment/hike.yaml", "# @package _global_\nsolver: {steps: 60}\n")

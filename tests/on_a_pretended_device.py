@@ -173,7 +173,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return choose
 
 
-EVALUATION = ("checkpoint=score", "prior.path=prior", "data.image_size=64", "start=ring", "start.count=3")
+EVALUATION = ("checkpoint=./score", "prior.path=prior", "data.image_size=64", "start=ring", "start.count=3")
 SHORT = {
     "two_stage": ("solver=two_stage", "solver.iterations=3", "solver.refinement_steps=3"),
     "id_pose": ("solver=id_pose", "solver.exploration_steps=2", "solver.refinement_steps=2"),
@@ -218,7 +218,7 @@ def test_training_learns_the_same_weights(commands, chosen, name, settings):
 
 def test_landscapes(commands, chosen):
     grid = ("longitude_step_degrees=30", "latitude_step_degrees=20", "noises=1")
-    settings = (*grid, "checkpoint=score", "prior.path=prior", "data.image_size=64")
+    settings = (*grid, "checkpoint=./score", "prior.path=prior", "data.image_size=64")
     found = []
     for place in ("here", "there"):
         pair = commands.here(f"pair_{place}", "landscape", "object=cup", "query=1", "solver.steps=3", *settings)
@@ -235,7 +235,7 @@ def test_estimate_and_views(commands, chosen):
     found = []
     for place in ("here", "there"):
         settings = ("prior.path=prior", "crop=false")
-        images = (f"images=[{files[0]},{files[1]}]", "checkpoint=score", "solver.refinement_steps=3")
+        images = (f"images=[{files[0]},{files[1]}]", "checkpoint=./score", "solver.refinement_steps=3")
         estimated = commands.here(f"estimate_{place}", "estimate", *images, *settings)
         views = commands.here(f"views_{place}", "views", f"image={files[0]}", "longitudes=2", "steps=3", *settings)
         assert (estimated.status, views.status) == (0, 0), (estimated.err, views.err)

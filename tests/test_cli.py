@@ -86,10 +86,11 @@ def test_a_yaml_with_a_name_is_one_more_choice(lp, walker):
 
 
 def test_the_users_own_folder_wins_over_a_plugins(lp, walker, write):
-    write("configs/solver/walk.yaml", "steps: 8\n")
-    write("configs/solver/stroll.yaml", "name: walk\ngamma: 0.1\n")
-    assert config_of(lp(*DEMO, "--cfg", "job"))["solver"]["steps"] == 8
-    assert config_of(lp(*DEMO, "solver=stroll", "--cfg", "job"))["solver"]["gamma"] == 0.1
+    write("configs/solver/long_walk.yaml", "defaults: [walk, _self_]\nsteps: 8\n")
+    write("configs/solver/stroll.yaml", "defaults: [walk, _self_]\ngamma: 0.1\n")
+    assert config_of(lp(*DEMO, "solver=long_walk", "--cfg", "job"))["solver"]["steps"] == 8
+    solver = config_of(lp(*DEMO, "solver=stroll", "--cfg", "job"))["solver"]
+    assert (solver["name"], solver["gamma"], solver["steps"]) == ("walk", 0.1, 7)
 
 
 def test_an_experiment_holds_differences(lp, walker):
@@ -102,9 +103,10 @@ def test_an_experiment_of_another_command_says_whose_it_is(lp, write):
         write(f"odd/experiment/{name}.yaml", f"{content}\n")
     finished = lp("figure", "experiment=gamma", "--config-dir", "odd")
     assert finished.status == 2
-    assert finished.error.startswith("experiment=gamma: is none of figure's (known: ")
+    assert finished.error.startswith(
+        "experiment=gamma belongs to estimate and eval and landscape, not to figure (known: "
+    )
     assert "figure_cameras, " in finished.error and "stages" not in finished.error
-    assert finished.error.endswith("; it goes with eval or estimate or landscape")
 
 
 @pytest.mark.parametrize("folder", ["hydra.run.dir=file/run", "hydra.run.dir=file", "hydra.sweep.dir=file/sweep"])
@@ -113,7 +115,7 @@ def test_a_folder_that_cannot_be_made_is_named(lp, walker, write, jobs, folder):
     sweep = ("--multirun", "solver.steps=1,2") if "sweep" in folder else ()
     finished = lp(*DEMO, folder, *sweep)
     assert finished.status == 2 and not jobs
-    assert finished.error.startswith("this run's folder cannot be made: [Errno ")
+    assert finished.error.startswith("the folder of this run cannot be made: [Errno ")
 
 
 @pytest.mark.parametrize("command", ["train", "eval"])
@@ -121,24 +123,25 @@ def test_so_does_one_that_only_sets_what_another_command_has(lp, command):
     """`train` has a backbone without the setting, `eval` none at all."""
     finished = lp(command, "experiment=gpu")
     assert finished.status == 2
-    assert finished.error.startswith(f"experiment=gpu: is none of {command}'s (known: ")
-    assert finished.error.endswith("; it goes with bench")
+    assert finished.error.startswith(f"experiment=gpu belongs to bench, not to {command} (known: ")
 
 
 def test_a_yaml_may_choose_a_member_of_another_group(lp, walker, write):
-    write("configs/solver/walk.yaml", "defaults: [{/model@_global_.second: net}]\nsteps: 9\n")
-    config = config_of(lp(*DEMO, "--cfg", "job"))
+    write("configs/solver/pair.yaml", "defaults: [walk, {/model@_global_.second: net}, _self_]\nsteps: 9\n")
+    config = config_of(lp(*DEMO, "solver=pair", "--cfg", "job"))
     assert config["second"] == {"name": "net", "width": 3}
     assert config["solver"]["steps"] == 9 and "defaults" not in config["solver"]
 
 
 def test_the_help_of_a_command_lists_choices_and_settings(lp, walker):
     finished = lp(*DEMO, "--help")
-    assert finished.status == 0
+    assert finished.status == 0 and "A demo of the help." in finished.out
     assert "solver: " in finished.out and "jump, " in finished.out and "long_walk" in finished.out
     experiments = re.search(r"experiment: (.+)", finished.out)
-    assert experiments is not None and {"broken", "hike"} < set(experiments[1].split(", "))
-    assert "gamma: 0.3" in finished.out and "--multirun" in finished.out
+    assert experiments is not None and {"broken", "hike"} <= set(experiments[1].split(", "))
+    assert "solver.gamma: 0.3" in finished.out and "seed: 0 # of every draw" in finished.out
+    assert "solver.steps: 700" in lp(*DEMO, "solver=long_walk", "--help").out
+    assert "--multirun" in finished.out and "trainer" not in finished.out
 
 
 @pytest.mark.parametrize("command", [command for command in cli.COMMANDS if command != "plugins"])
@@ -155,7 +158,7 @@ def test_a_run_keeps_its_config_and_log_in_its_folder(lp, jobs, walker):
     finished = lp(*DEMO, "solver.gamma=1")
     assert (finished.status, finished.out, finished.err) == (0, "", "")
     (config, argv), = jobs  # fmt: skip
-    assert type(config.solver.gamma) is float
+    assert config.solver.gamma == 1
     (folder,) = (walker / "runs" / "demo").iterdir()
     assert OmegaConf.load(folder / ".hydra" / "config.yaml") == config
     assert (folder / "train.log").exists()
@@ -171,9 +174,9 @@ def test_a_saved_config_holds_names_and_numbers_only(lp, jobs, walker):
 
 def test_bad_input_met_while_running_is_one_sentence_and_in_the_log(lp, jobs, walker):
     finished = lp(*DEMO, "solver.gamma=2")
-    assert finished.status == 1 and finished.error == "gamma is 2.0, it must not exceed 1"
+    assert finished.status == 1 and finished.error == "gamma is 2, it must not exceed 1"
     (folder,) = (walker / "runs" / "demo").iterdir()
-    assert "gamma is 2.0, it must not exceed 1" in (folder / "train.log").read_text()
+    assert "gamma is 2, it must not exceed 1" in (folder / "train.log").read_text()
 
 
 def test_a_bug_keeps_its_traceback(lp, jobs, walker):
@@ -205,7 +208,7 @@ def test_a_job_that_fails_does_not_stop_a_sweep(lp, jobs, bad, status):
     else:
         finished = lp(*DEMO, "--multirun", bad)
         assert finished.status == status
-        assert "job 1 (solver.gamma=2): gamma is 2.0" in finished.err and "Traceback" not in finished.err
+        assert "job 1 (solver.gamma=2): gamma is 2" in finished.err and "Traceback" not in finished.err
     assert len(jobs) == 3
 
 
@@ -285,10 +288,6 @@ WORKER = """
         ),
         ((*DEMO, "gamma=1"), "gamma: the configuration has no 'gamma'; did you mean 'solver.gamma'?"),
         ((*DEMO, "sed=1"), "sed: the configuration has no 'sed'; did you mean 'seed'?"),
-        ((*DEMO, "solver.gamma=high"), "solver.gamma: Value 'high' of type 'str' could not be converted to Float"),
-        ((*DEMO, "solver.limit=low"), "solver.limit: Value 'low' of type 'str' could not be converted to Float"),
-        ((*DEMO, "solver.steps=1.5"), "solver.steps: Value '1.5' of type 'float' could not be converted to Integer"),
-        ((*DEMO, "experiment=broken"), "In 'experiment/broken': solver.stepz: solver has no 'stepz'; did you mean 's"),
         ((*DEMO, "solver=walk,jump"), "'solver=walk,jump' has several values: add --multirun to run each"),
         ((*DEMO, "seed=1,2"), "'seed=1,2' has several values: add --multirun to run each, or write a list, seed=[1,2]"),
         ((*DEMO, "solver.gamma=[1"), "cannot read 'solver.gamma=[1': "),
@@ -311,23 +310,21 @@ def test_a_command_line_that_makes_no_sense(lp, jobs, arguments, sentence):
     ("text", "sentence"),
     [
         ("stepz: 3\n", "walk.yaml: solver 'walk' has no 'stepz'; did you mean 'steps'? (known: name, gamma, "),
-        ("steps: many\n", "walk.yaml: Value 'many' of type 'str' could not be converted to Integer"),
-        ("steps: [1\n", "walk.yaml: not valid YAML: "),
+        ("steps: [1\n", "walk.yaml: while parsing a flow sequence"),
         ("- steps\n", "walk.yaml: a configuration is a mapping 'key: value', not a list"),
-        ("name: wlk\n", "walk.yaml: 'wlk' is no solver; did you mean 'walk'? (known: "),
     ],
 )
-def test_a_file_with_a_mistake_is_named(lp, jobs, write, text, sentence):
-    write("configs/solver/walk.yaml", text)
-    finished = lp(*DEMO)
-    assert finished.status == 1 and sentence in finished.error
+def test_a_plugins_file_with_a_mistake_is_named_and_left_out(lp, walker, write, text, sentence):
+    write("plugins/walker/conf/solver/walk.yaml", text)
+    finished = lp(*DEMO, "--cfg", "job")
+    assert finished.err.startswith("warning: a plugin's configuration is left out: ") and sentence in finished.err
+    assert config_of(finished)["solver"]["steps"] == 50  # of the constructor
 
 
-def test_a_file_of_no_registered_name_must_say_of_what_it_is_a_preset(lp, jobs, write):
-    write("configs/solver/mine.yaml", "steps: 3\n")
+def test_the_users_file_with_a_mistake_is_named(lp, walker, write):
+    write("configs/solver/mine.yaml", "steps: [1\n")
     finished = lp(*DEMO, "solver=mine")
-    assert finished.status == 1
-    assert "mine.yaml: 'mine' is no solver" in finished.error and "a preset" in finished.error
+    assert finished.status == 2 and "mine.yaml" in finished.error
 
 
 def test_a_setting_without_a_default_has_to_be_given(lp, jobs, walker, monkeypatch):

@@ -21,8 +21,9 @@ from PIL import Image
 from torch import Tensor
 
 import lp_framework
+from lp_framework import registry
+from lp_framework.commands.building import Components, plain
 from lp_framework.commands.estimate import warn_of_prior
-from lp_framework.composition import conf_dir
 from lp_framework.data.photographs import on_white, prepare
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world
@@ -210,7 +211,7 @@ def test_mistakes_are_met_before_any_model_is_loaded(lp, photos, overrides, erro
 
 
 def test_the_function_has_the_defaults_of_the_command():
-    config = OmegaConf.load(conf_dir() / "estimate.yaml")
+    config = OmegaConf.load(registry.conf_dir() / "estimate.yaml")
     chosen = {key: value for each in config.defaults if not isinstance(each, str) for key, value in each.items()}
     defaults = {
         key: parameter.default
@@ -308,7 +309,7 @@ def test_who_rests_on_the_prior_that_ships_is_told(lp, clean_registry, caplog):
     def told(*overrides: str) -> bool:
         printed = lp("estimate", "images=x", "--cfg", "job", *overrides).out
         caplog.clear()
-        warn_of_prior(OmegaConf.create(printed))
+        warn_of_prior(Components(plain(OmegaConf.create(printed))))
         return "prior=tiny as it ships knows the twelve embedded objects" in caplog.text
 
     assert told() and told("solver=ifusion")

@@ -28,7 +28,7 @@ def answers(folder: Path) -> list[list[float]]:
 
 
 def test_two_processes_give_the_answers_of_one(commands):
-    settings = ("solver=two_stage", "solver.refinement_steps=4", "checkpoint=score", *DESCENT)
+    settings = ("solver=two_stage", "solver.refinement_steps=4", "checkpoint=./score", *DESCENT)
     one: Ran = commands.here("one", "eval", *settings)
     assert one.status == 0, one.err
     spread = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")

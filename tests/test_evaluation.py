@@ -23,6 +23,7 @@ from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairBatch
 from lp_framework.evaluation.evaluation import errors
 from lp_framework.geometry import camera_to_world, relative_camera, rigid_transform, so3_exp
+from lp_framework.models.checkpoints import SHIPPED
 from lp_framework.solvers.base import Cost, Solution
 from lp_framework.solvers.starts import Ring
 
@@ -44,7 +45,7 @@ def commands(tmp_path_factory) -> Commands:
 @pytest.fixture(scope="module")
 def evaluated(commands) -> Ran:
     """The score model, evaluated by default settings."""
-    ran = commands.here("evaluated", "eval", "checkpoint=score")
+    ran = commands.here("evaluated", "eval", "checkpoint=./score")
     assert ran.status == 0, ran.err
     return ran
 
@@ -134,15 +135,15 @@ def test_the_table_has_the_papers_layout_and_the_last_lines_name_the_files(evalu
 
 
 def test_a_run_again_gives_the_same_numbers(evaluated, commands):
-    again = commands.here("again", "eval", "checkpoint=score/checkpoints/best.ckpt")
+    again = commands.here("again", "eval", "checkpoint=./score/checkpoints/best.ckpt")
     assert comparable(again) == comparable(evaluated)
     assert (again.folder / "pairs.csv").read_bytes() == (evaluated.folder / "pairs.csv").read_bytes()
-    other = commands.here("other", "eval", "checkpoint=score", "seed=1")
+    other = commands.here("other", "eval", "checkpoint=./score", "seed=1")
     assert (other.folder / "pairs.csv").read_bytes() != (evaluated.folder / "pairs.csv").read_bytes()
 
 
 def test_per_view_takes_every_test_view_once_as_query(commands):
-    ran = commands.here("per_view", "eval", "checkpoint=score", "protocol=per_view")
+    ran = commands.here("per_view", "eval", "checkpoint=./score", "protocol=per_view")
     rows = pair_rows(ran)
     assert {(row["object"], row["query"]) for row in rows} == {
         (name, f"{view:03d}.png") for name in OBJECTS for view in range(TEST_VIEWS)
@@ -151,7 +152,7 @@ def test_per_view_takes_every_test_view_once_as_query(commands):
 
 
 def test_ifusions_protocol_takes_20_pairs_of_the_first_training_views(commands):
-    ran = commands.here("ifusion", "eval", "checkpoint=score", "protocol=ifusion")
+    ran = commands.here("ifusion", "eval", "checkpoint=./score", "protocol=ifusion")
     rows = pair_rows(ran)
     assert ran.json()["pairs"] == len(rows) == 20 * len(OBJECTS)
     assert {row["reference"] for row in rows} == {f"{view:03d}.png" for view in range(5)}
@@ -162,13 +163,13 @@ def test_the_energy_model_is_evaluated_and_may_choose_by_its_energy(commands):
     assert ran.status == 0, ran.err
     assert ran.json()["metrics"].keys() == METRICS
     assert "choose_by=energy needs model=energy" in (
-        commands.here("no_energy", "eval", "checkpoint=score", "solver.choose_by=energy").error
+        commands.here("no_energy", "eval", "checkpoint=./score", "solver.choose_by=energy").error
     )
 
 
 def test_a_sweep_has_a_folder_and_results_for_every_combination(commands):
     ran = commands.here(
-        "unused", "eval", "--multirun", "checkpoint=score", "protocol=per_view", "start=random", "start.count=1,2",
+        "unused", "eval", "--multirun", "checkpoint=./score", "protocol=per_view", "start=random", "start.count=1,2",
         "solver.gamma=0,0.3", "hydra.sweep.dir=sweep",
     )  # fmt: skip
     assert ran.status == 0, ran.err
@@ -183,7 +184,7 @@ def test_a_sweep_has_a_folder_and_results_for_every_combination(commands):
 
 def test_two_processes_give_every_number_of_one(evaluated, commands):
     spread = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
-    two = commands.process("two", "eval", "checkpoint=score", *spread)
+    two = commands.process("two", "eval", "checkpoint=./score", *spread)
     assert (two.status, two.err) == (0, "")
     assert "MEMBER: 1/2" in (two.folder / "eval.log").read_text()  # there were two
     assert close(comparable(two), comparable(evaluated))
@@ -211,7 +212,7 @@ def test_a_batch_of_pairs_fills_a_large_prior_and_no_more(monkeypatch, solver, s
 
 
 def test_poses_are_not_computed_in_less_than_float32(commands):
-    ran = commands.here("half", "eval", "checkpoint=score", "trainer.precision=bf16-mixed")
+    ran = commands.here("half", "eval", "checkpoint=./score", "trainer.precision=bf16-mixed")
     assert ran.error.startswith("trainer.precision: poses are computed in float32")
 
 
@@ -281,23 +282,25 @@ def recipe(commands: Commands, group: str, **changes: Any) -> dict[str, Any]:
 
 
 def test_what_a_solver_does_not_take_is_said_and_its_model_is_named(commands):
-    quick = ("solver.iterations=1", "checkpoint=score")
+    quick = ("solver.iterations=1", "checkpoint=./score")
     ran = commands.here("unused", "eval", *quick, "prior.path=nowhere")
     assert ran.status == 0 and "WARNING: prior=... has no effect: solver=langevin takes no prior" in ran.err
-    assert f"model:    {Path('score/checkpoints/best.ckpt')}\n" in ran.out
+    assert ran.out.startswith(f"model: {Path('score/checkpoints/best.ckpt')}\n")
     ran = commands.here("unused_model", "eval", "checkpoint=nowhere", "solver=features")
     assert "WARNING: checkpoint=... has no effect: solver=features takes no model" in ran.err
 
 
-def test_a_latest_model_of_other_objects_is_warned_of(commands):
+def test_without_a_checkpoint_the_model_is_the_one_that_ships(commands):
+    """Whatever has been trained here last: only `checkpoint=latest` means that."""
     latest = commands.folder / "runs" / "train" / "latest"
     shutil.copytree(commands.folder / "score", latest)
     try:
-        for objects, warned in ((["zebra"], True), (["zebra", "cup"], False)):
-            (latest / "training.json").write_text(json.dumps({"objects": objects}))
-            ran = commands.here(f"of_{len(objects)}", "eval", "solver.iterations=1")
-            assert ("best.ckpt was trained on other objects than these; checkpoint=..." in ran.err) == warned
-            assert "(of the latest training run; checkpoint=... for others)" in ran.out
+        quick = ("solver.iterations=1", "solver.gamma=0")
+        shipped = commands.here("shipped", "eval", *quick)
+        assert shipped.out.startswith("model: score, which ships with lp_framework (trained on the twelve embedded ")
+        assert Path(shipped.json()["checkpoint"]) == SHIPPED / "score" / "model.safetensors"
+        asked = commands.here("asked", "eval", *quick, "checkpoint=latest")
+        assert asked.out.startswith(f"model: {Path('runs/train/latest/checkpoints/best.ckpt')}\n")
     finally:
         shutil.rmtree(latest.parents[1])
 
@@ -305,16 +308,16 @@ def test_a_latest_model_of_other_objects_is_warned_of(commands):
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ("log_every_n_steps=abc", "trainer.log_every_n_steps=abc is not of its type, Optional[int]"),
+        ("log_every_n_steps=abc", "trainer.log_every_n_steps=abc does not fit; expected Optional[int]"),
         (
             "deterministic=maybe",
-            "trainer.deterministic=maybe is not of its type, Union[bool, Literal['warn'], NoneType]",
+            "trainer.deterministic=maybe does not fit; expected Union[bool, Literal['warn'], NoneType]",
         ),
         ("accelerator=tpu", "trainer: Requirement 'torch_xla"),
     ],
 )
 def test_odd_settings_of_the_trainer(commands, setting, sentence):
-    assert commands.here("odd", "eval", f"++trainer.{setting}", "checkpoint=score").error.startswith(sentence)
+    assert commands.here("odd", "eval", f"++trainer.{setting}", "checkpoint=./score").error.startswith(sentence)
 
 
 def test_a_checkpoint_that_is_not_there(commands):
@@ -377,6 +380,6 @@ def test_a_frozen_trunk_other_than_that_of_training_is_noticed(commands):
 def test_objects_need_no_training_views_to_be_evaluated(commands):
     folder = commands.folder / "only_tests" / "cup"
     shutil.copytree(commands.folder / "views" / "cup" / "test", folder / "test")
-    ran = commands.here("only", "eval", "checkpoint=score", "data.path=only_tests")
+    ran = commands.here("only", "eval", "checkpoint=./score", "data.path=only_tests")
     assert ran.status == 0, ran.err
     assert list(ran.json()["per_object"]) == ["cup"]

@@ -62,7 +62,7 @@ def test_the_installed_command_finds_its_configs_from_another_folder(installed, 
     printed = run(installed / "lp", "train", "--cfg", "job", cwd=tmp_path).stdout
     assert OmegaConf.create(printed).model.name == "score"
     assert run(installed / "lp", "--version", cwd=tmp_path).stdout == "lp_framework 0.1.0\n"
-    where = "import lp_framework.composition as c; print(c.__file__, c.conf_dir())"
+    where = "import lp_framework.registry as c; print(c.__file__, c.conf_dir())"
     module, conf = run(installed / "python", "-c", where, cwd=tmp_path).stdout.split()
     assert Path(conf) == Path(module).parent / "conf" and ROOT not in Path(conf).parents
 

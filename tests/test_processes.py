@@ -26,7 +26,11 @@ pytestmark = pytest.mark.skipif(
 )
 TEST_VIEWS = 5
 SPREAD = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
-EVALUATION = ("checkpoint=score", "batch_pairs=7", "solver.iterations=5")  # 80 pairs are 12 batches, the last one of 3
+EVALUATION = (
+    "checkpoint=./score",
+    "batch_pairs=7",
+    "solver.iterations=5",
+)  # 80 pairs: 12 batches, the last of 3
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +183,7 @@ def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(
 
 
 def test_a_strategy_that_needs_gpus_says_so_in_a_sentence(commands):
-    ran = commands.here("fsdp", "eval", "checkpoint=score", "trainer.strategy=fsdp", "trainer.accelerator=cpu")
+    ran = commands.here("fsdp", "eval", "checkpoint=./score", "trainer.strategy=fsdp", "trainer.accelerator=cpu")
     assert ran.error.startswith("trainer: The strategy `fsdp` requires a GPU accelerator")
 
 

@@ -23,7 +23,7 @@ from lp_framework.evaluation.metrics import SolvedBatch
 TEST_VIEWS = 5
 PAIRS = len(OBJECTS) * TEST_VIEWS * (TEST_VIEWS - 1)
 BATCH = 7  # 80 pairs are 12 batches, the last one of 3
-EVALUATION = ("checkpoint=score", f"batch_pairs={BATCH}", "solver.iterations=5")
+EVALUATION = ("checkpoint=./score", f"batch_pairs={BATCH}", "solver.iterations=5")
 
 
 @pytest.fixture(autouse=True)
@@ -344,7 +344,7 @@ def test_the_fingerprint_of_networks_changes_with_every_tensor():
 
 def test_pairs_are_saved_few_at_a_time_where_networks_are_large(commands, monkeypatch):
     monkeypatch.setattr("lp_framework.commands.eval.LARGE", 100)
-    ran = commands.here("large", "eval", "checkpoint=score", "solver.iterations=0", "protocol=per_view")
+    ran = commands.here("large", "eval", "checkpoint=./score", "solver.iterations=0", "protocol=per_view")
     assert ran.status == 0
     with (ran.folder / "pairs.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(OBJECTS) * TEST_VIEWS

@@ -17,7 +17,7 @@ from tiny_runs import Commands, Ran
 from lp_framework.evaluation.paper import paper_tables
 
 ROOT = Path(__file__).parents[1]
-SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=score", "solver.iterations=2")
+SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2")
 
 
 # ---------------------------------------------------------------- experiments
@@ -179,13 +179,13 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
 def test_a_single_run_is_made_anew(commands, monkeypatch):
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
     for _ in range(2):
-        ran = commands.here("single", "eval", "checkpoint=score", "solver.iterations=2")
+        ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2")
         assert ran.status == 0 and "skipped" not in ran.out
 
 
 def test_an_experiment_goes_on_in_its_own_folder(commands, monkeypatch):
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
-    first = ("experiment=gamma", "solver=langevin", "checkpoint=score", "seed=0", "solver.gamma=0,0.3")
+    first = ("experiment=gamma", "solver=langevin", "checkpoint=./score", "seed=0", "solver.gamma=0,0.3")
     assert commands.here("unused", "eval", *first).status == 0
     more = commands.here("unused", "eval", *first[:-2], "seed=0,1", "solver.gamma=0,0.3")
     assert more.status == 0 and more.out.count("skipped, finished before: ") == 2
@@ -218,7 +218,7 @@ def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice
     quick.mkdir(exist_ok=True)
     (quick / "tmp_tiny_quick.py").write_text(QUICK)
     name = launcher[0].partition("=")[2]
-    sweep = ("experiment=gamma", f"hydra.sweep.dir={name}", "solver=tmp_tiny_quick", "checkpoint=score", "seed=0",
+    sweep = ("experiment=gamma", f"hydra.sweep.dir={name}", "solver=tmp_tiny_quick", "checkpoint=./score", "seed=0",
              f"solver.gamma={','.join(map(str, gammas))}")  # fmt: skip
     ran = commands.process("unused", "eval", *sweep, *launcher)
     assert ran.status == 0, ran.err

@@ -7,7 +7,9 @@ import os
 import re
 import shutil
 import signal
+import sys
 import time
+import types
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ import pytest
 import torch
 from tiny_runs import Commands, Ran
 
-from lp_framework.models.checkpoints import SHIPPED, default_checkpoint, find_checkpoint, load_model, read_checkpoint
+from lp_framework.errors import UserError
+from lp_framework.models.checkpoints import SHIPPED, find_checkpoint, latest_checkpoint, load_model, read_checkpoint
 
 EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6", "backbone.pause=0.1")
 
@@ -97,7 +100,8 @@ def test_the_console_ends_with_the_model_and_the_next_command(score):
     lines = [" ".join(line.split()) for line in score.out.splitlines()]
     # Relative to the working directory, in which the runs of these tests lie.
     assert f"model: {score.folder.name}/checkpoints/best.ckpt" in lines
-    assert lines[-1] == f"next: python -m lp_framework eval checkpoint={score.folder.name}"
+    evaluation = f"next: python -m lp_framework eval checkpoint={score.folder.name} data=renderings"
+    assert lines[-1] == f"{evaluation} data.image_size=16 data.path=views"
 
 
 def test_the_console_has_no_notes_and_advertisements(score, commands):
@@ -240,7 +244,8 @@ def test_a_training_that_diverges_is_an_error_and_its_model_is_not_taken(command
     ran = commands.here("runs/train/far", "train", "model.learning_rate=1e30", "trainer.max_epochs=1")
     assert ran.status == 1 and re.search(r"error: .*far: the training has diverged \(.*loss.*: not finite\)", ran.err)
     monkeypatch.chdir(commands.folder)
-    assert "far" not in str(default_checkpoint())
+    with pytest.raises(UserError, match="checkpoint=latest: there is no training run of a model in "):
+        find_checkpoint("latest")
 
 
 @pytest.mark.parametrize(
@@ -316,7 +321,7 @@ def test_two_processes_report_the_validation_loss_of_one(commands):
 # ---------------------------------------------------------------- checkpoint files
 
 
-def test_a_run_a_checkpoint_and_the_latest_run_are_found(score, commands, tmp_path):
+def test_a_run_a_checkpoint_and_the_latest_run_are_found(score, commands, tmp_path, monkeypatch):
     best = score.folder / "checkpoints" / "best.ckpt"
     assert find_checkpoint(score.folder) == best
     assert find_checkpoint(score.folder / "checkpoints") == best
@@ -325,10 +330,37 @@ def test_a_run_a_checkpoint_and_the_latest_run_are_found(score, commands, tmp_pa
         shutil.copytree(score.folder / "checkpoints", tmp_path / name / "checkpoints")
         last = tmp_path / name / "checkpoints" / "last.ckpt"
         os.utime(last, (1e9 - age, 1e9 - age))
-    assert default_checkpoint(tmp_path) == tmp_path / "new" / "checkpoints" / "best.ckpt"
+    assert latest_checkpoint(tmp_path) == tmp_path / "new" / "checkpoints" / "best.ckpt"
     (tmp_path / "new" / "checkpoints" / "best.ckpt").unlink()
-    assert default_checkpoint(tmp_path).name == "last.ckpt"
-    assert default_checkpoint(tmp_path / "nothing") == SHIPPED / "score" / "model.safetensors"
+    assert latest_checkpoint(tmp_path).name == "last.ckpt"
+    assert find_checkpoint("score") == SHIPPED / "score" / "model.safetensors"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "new").rename(tmp_path / "runs" / "train")
+    (tmp_path / "runs" / "train" / "checkpoints").rename(tmp_path / "runs" / "checkpoints")
+    (tmp_path / "runs" / "train" / "one").mkdir()
+    (tmp_path / "runs" / "checkpoints").rename(tmp_path / "runs" / "train" / "one" / "checkpoints")
+    assert find_checkpoint("latest") == Path("runs/train/one/checkpoints/last.ckpt")
+
+
+def test_a_checkpoint_of_the_hub_is_fetched_by_its_id(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    asked = []
+
+    def snapshot_download(name, allow_patterns):
+        asked.append((name, sorted(allow_patterns)))
+        if name == "somebody/nothing":
+            raise OSError("no such repository")
+        return str(tmp_path)
+
+    hub = types.SimpleNamespace(snapshot_download=snapshot_download)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    assert find_checkpoint("somebody/model") == tmp_path / "model.safetensors"
+    assert asked == [("somebody/model", ["model.json", "model.safetensors"])]
+    with pytest.raises(UserError, match="checkpoint=somebody/nothing: is neither a file or folder nor on the hub"):
+        find_checkpoint("somebody/nothing")
+    (tmp_path / "runs").mkdir()
+    assert find_checkpoint("runs/nothing") == Path("runs/nothing")  # a path whose folder is here asks nobody
 
 
 def test_reading_a_checkpoint_runs_no_code_of_it(score):

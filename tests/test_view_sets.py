@@ -146,9 +146,9 @@ def test_how_many_images_there_may_be(data, views):
 
 
 def test_a_solver_of_pairs_gives_each_image_the_answer_of_its_pair(commands):
-    ran = commands.here("sets", "eval", "checkpoint=score", "solver.gamma=0", "views=3")
+    ran = commands.here("sets", "eval", "checkpoint=./score", "solver.gamma=0", "views=3")
     assert (ran.status, ran.err) == (0, "")
-    ordered = commands.here("ordered", "eval", "checkpoint=score", "solver.gamma=0")
+    ordered = commands.here("ordered", "eval", "checkpoint=./score", "solver.gamma=0")
     rows, results = pair_rows(ran), ran.json()
     assert (results["protocol"], results["config"]["views"]) == ("view_sets", 3)
     assert results["pairs"] == len(rows) == len(OBJECTS) * TEST_VIEWS * 2
@@ -167,10 +167,10 @@ def test_a_solver_of_pairs_gives_each_image_the_answer_of_its_pair(commands):
 
 
 def test_the_joint_solver_from_the_command_line(commands):
-    ran = commands.here("joint", "eval", "checkpoint=score", "solver=multiview", "views=4", "start=random")
+    ran = commands.here("joint", "eval", "checkpoint=./score", "solver=multiview", "views=4", "start=random")
     assert ran.status == 0, ran.err
     assert ran.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 3
-    again = commands.here("again", "eval", "checkpoint=score", "solver=multiview", "views=4", "start=random")
+    again = commands.here("again", "eval", "checkpoint=./score", "solver=multiview", "views=4", "start=random")
     assert (again.folder / "pairs.csv").read_bytes() == (ran.folder / "pairs.csv").read_bytes()
     by_pair = {(row["object"], row["reference"], row["query"]): row for row in pair_rows(ran)}
     examples = read_examples(ran.folder / "pictures" / "examples")
@@ -184,18 +184,18 @@ def test_the_joint_solver_from_the_command_line(commands):
     page = (ran.folder / "report.html").read_text()
     assert "the solver's steps were not kept" in html.unescape(page) and "slider plays" not in page
     fit = commands.here(
-        "fit", "eval", "checkpoint=score", "solver=multiview", "solver.second_stage=false", "views=4", "start=random"
+        "fit", "eval", "checkpoint=./score", "solver=multiview", "solver.second_stage=false", "views=4", "start=random"
     )
     assert fit.json()["seconds_per_pair"] < ran.json()["seconds_per_pair"]
 
 
 def test_mistakes_are_named(commands):
-    assert commands.here("x", "eval", "checkpoint=score", "views=9").error == (
+    assert commands.here("x", "eval", "checkpoint=./score", "views=9").error == (
         "views must be 2 to 8 images, or null for pairs; got 9"
     )
-    assert commands.here("x", "eval", "checkpoint=score", "views=6").error == (
+    assert commands.here("x", "eval", "checkpoint=./score", "views=6").error == (
         f"object '{sorted(OBJECTS)[0]}' has {TEST_VIEWS} views here; sets of views=6 need as many"
     )
-    assert commands.here("x", "eval", "checkpoint=score", "views=3", "protocol=per_view").error == (
+    assert commands.here("x", "eval", "checkpoint=./score", "views=3", "protocol=per_view").error == (
         "protocol=per_view is one of pairs; views=3 has its own, leave it out"
     )

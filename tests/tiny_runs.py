@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.config_store import ConfigStore
 from view_folders import write_objects
 
 from lp_framework import cli, registry
@@ -146,6 +147,7 @@ def _aside(folder: Path) -> Iterator[None]:
     here, argv, path = Path.cwd(), sys.argv, list(sys.path)
     state, deterministic = registry._state, torch.are_deterministic_algorithms_enabled()
     registry._state = copy.deepcopy(state)
+    store, configs = ConfigStore.instance(), copy.deepcopy(ConfigStore.instance().repo)
     os.chdir(folder)
     try:
         yield
@@ -153,6 +155,7 @@ def _aside(folder: Path) -> Iterator[None]:
         os.chdir(here)
         sys.argv, sys.path[:] = argv, path
         registry._state = state
+        store.repo = configs
         torch.use_deterministic_algorithms(deterministic)
         for name in [name for name in sys.modules if name.startswith("tmp_tiny")]:
             del sys.modules[name]

@@ -30,7 +30,7 @@ from lp_framework.benchmarks import (
     second_stage,
 )
 from lp_framework.benchmarks.section import Section
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.pairs import PairData
 from lp_framework.data.toy import toy_objects
@@ -100,7 +100,7 @@ def _loader(config: DictConfig, device: torch.device) -> Iterator[Section]:
 def _encoding(config: DictConfig, device: torch.device) -> Iterator[Section]:
     settings = _settings(config, "encoding", "rounds")
     data, model = _training(config)
-    prior = registry.build("prior", config.prior)
+    prior = registry.build("prior", plain(config.prior))
     batch, block = config.data.batch_pairs, config.data.block
     note = f"{_training_note(config, model)}; prior={config.prior.name}"
     return encoding.measure(data, model, prior, batch, block, **settings, device=device, note=note)
@@ -139,10 +139,10 @@ def _precision(config: DictConfig, device: torch.device) -> Iterator[Section]:
 
 def _adam_gauss_newton(config: DictConfig, device: torch.device) -> Iterator[Section]:
     settings = _settings(config, "adam_gauss_newton", "pairs", "starts", "newton_steps", "adam_steps", "rounds")
-    data = build_data(config)
+    components = Components(plain(config))
+    data, prior = components["data"], components["prior"]
     data.evaluate_on("ordered", 0)
     data.prepare_data()
-    prior = registry.build("prior", config.prior)
     views, count = data.data("test"), settings.pop("pairs")
     starts = Ring(settings.pop("starts"))
     pairs = adam_gauss_newton.some_pairs(views, count, device)
@@ -172,7 +172,7 @@ def _checkpoint(config: DictConfig, device: torch.device) -> Iterator[Section]:
 
 def _scaling(config: DictConfig, device: torch.device) -> Iterator[Section]:
     settings = _settings(config, "scaling", "steps", "rounds")
-    prior = registry.build("prior", config.prior)
+    prior = registry.build("prior", plain(config.prior))
     return scaling.Scaling(device, _pose_model(), prior, **settings).measure()
 
 
@@ -192,10 +192,10 @@ MEASUREMENTS: dict[str, Callable[[DictConfig, torch.device], Iterator[Section]]]
 
 def _training(config: DictConfig) -> tuple[PairData, PoseModel]:
     """Training views, and a new model on the chosen backbone."""
-    data = build_data(config)
+    components = Components(plain(config))
+    data = components["data"]
     data.prepare_data()
-    backbone = registry.build("backbone", config.backbone)
-    return data.data("train"), registry.build("model", config.model, backbone=backbone)
+    return data.data("train"), components["model"]
 
 
 def _training_note(config: DictConfig, model: PoseModel) -> str:

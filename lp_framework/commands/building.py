@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
-import inspect
-import json
 import logging
 import platform
 import subprocess
-import typing
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -23,24 +20,18 @@ from lightning import Trainer, seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
-from lightning.pytorch.strategies import ModelParallelStrategy, StrategyRegistry
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from lp_framework import registry
 from lp_framework.api import TINY_KNOWS
-from lp_framework.composition import one_line
-from lp_framework.data.module import PairDataModule
-from lp_framework.errors import UserError
-from lp_framework.models.checkpoints import SHIPPED, default_checkpoint, find_checkpoint, load_model
-from lp_framework.solvers.base import Solver
+from lp_framework.errors import UserError, one_line
+from lp_framework.models.checkpoints import describe, find_checkpoint, load_model
 
 log = logging.getLogger(__name__)
 
 TRAINING = "training.json"  # what a training run says of itself
-DIVIDED = "model_parallel"  # the strategy that divides a prior among processes; Lightning has no name for it
-if DIVIDED not in StrategyRegistry.available_strategies():
-    StrategyRegistry.register(DIVIDED, ModelParallelStrategy, description="a prior divided among the processes")
 
 # Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
 OF_NO_USE = (
@@ -76,62 +67,67 @@ def orderly_console() -> Iterator[None]:
         yield
 
 
-def build_data(config: DictConfig) -> PairDataModule:
-    """The data module of a config, with its renderer."""
-    renderer = None
-    if "renderer" in registry.component_names(registry.get("data", config.data.name)):
-        renderer = registry.build("renderer", config.renderer)
-    data: PairDataModule = registry.build("data", config.data, renderer=renderer)
-    return data
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A config as dicts, lists, names and numbers."""
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    return {str(key): value for key, value in values.items()}
 
 
-def build_solver(config: DictConfig, known: Path | None = None) -> tuple[Solver, Path | None]:
-    """The solver of a config and the checkpoint of its model, with those of model and prior that it asks for.
+class Components:
+    """The objects that a config chooses, each built once when it is first asked for: `components["solver"]`.
 
-    The model is that of the checkpoint `known`, else `config.checkpoint`, else the latest training run's, else the one
-    that ships.
+    An object gets the components that its constructor declares. Where the config has no group `model`, the model is
+    that of a checkpoint: of the setting `checkpoint`, or of the one given here.
     """
-    wanted = registry.component_names(registry.get("solver", config.solver.name))
-    components: dict[str, Any] = {}
-    checkpoint: Path | None = None
-    if "model" in wanted:
-        chosen = config.checkpoint if known is None else known
-        checkpoint = default_checkpoint() if chosen is None else find_checkpoint(chosen)
-        components["model"] = load_model(checkpoint)
-    if "prior" in wanted:
-        components["prior"] = registry.build("prior", config.prior)
-    return registry.build("solver", config.solver, **components), checkpoint
+
+    def __init__(self, settings: Mapping[str, Any], checkpoint: Path | None = None) -> None:
+        self.settings = settings
+        self.checkpoint = checkpoint
+        self._built: dict[str, Any] = {}
+
+    def __getitem__(self, group: str) -> Any:
+        if group not in self._built:
+            self._built[group] = self._trained_model() if self._is_trained(group) else self._build(group)
+        return self._built[group]
+
+    def needs(self, group: str) -> list[str]:
+        """The components that the chosen member of a group asks for."""
+        return registry.component_names(registry.get(group, self.settings[group]["name"]))
+
+    def _build(self, group: str) -> Any:
+        return registry.build(group, self.settings[group], **{each: self[each] for each in self.needs(group)})
+
+    def _is_trained(self, group: str) -> bool:
+        return group == "model" and group not in self.settings
+
+    def _trained_model(self) -> nn.Module:
+        if self.checkpoint is None:
+            self.checkpoint = find_checkpoint(self.settings["checkpoint"])
+        _say(f"model: {describe(self.checkpoint)}")
+        return load_model(self.checkpoint)
 
 
-def warn_of_unused(config: DictConfig) -> None:
-    """Of a prior or a checkpoint that the command line names and the solver does not ask for, say so.
+@rank_zero_only
+def _say(text: str) -> None:
+    print(text)
+
+
+def warn_of_unused(components: Components) -> None:
+    """Say that a prior or a checkpoint named on the command line has no effect, because the solver takes none.
 
     Not in a sweep, which may go over solvers that do.
     """
-    job, name = HydraConfig.get(), config.solver.name
-    wanted = registry.component_names(registry.get("solver", name))
+    job, name = HydraConfig.get(), components.settings["solver"]["name"]
     named = {override.partition("=")[0].strip("+~").partition(".")[0] for override in job.overrides.task}
     for key, component in (("prior", "prior"), ("checkpoint", "model")):
-        if key in named and component not in wanted and job.mode != RunMode.MULTIRUN:
+        if key in named and component not in components.needs("solver") and job.mode != RunMode.MULTIRUN:
             log.warning("%s=... has no effect: solver=%s takes no %s", key, name, component)
 
 
-def warn_of_other_objects(checkpoint: Path, names: Sequence[str]) -> None:
-    """Of a model that nobody chose: say so where it was trained on none of these objects."""
-    try:
-        trained = json.loads((checkpoint.parents[1] / TRAINING).read_text(encoding="utf-8"))["objects"]
-    except (OSError, ValueError, LookupError, TypeError):  # the one that ships, or a run that was stopped
-        return
-    if isinstance(trained, list) and not {*names} & {*map(str, trained)}:
-        log.warning("%s was trained on other objects than these; checkpoint=... chooses another model", checkpoint)
-
-
-def model_origin(checkpoint: Path, chosen: object) -> str:
-    """Which model a solver has, for the terminal; `chosen` is the config's `checkpoint`."""
-    if checkpoint.is_relative_to(SHIPPED):
-        return "the one that ships"
-    found = "" if chosen is not None else " (of the latest training run; checkpoint=... for others)"
-    return f"{checkpoint}{found}"
+def warn_of_photographs(prior: Mapping[str, Any]) -> None:
+    """Say that the bundled prior knows no photographs where `prior`, its settings, choose it."""
+    if prior["name"] == "tiny" and prior["path"] is None:
+        log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_KNOWS)
 
 
 def seed_run(seed: object) -> None:
@@ -141,19 +137,16 @@ def seed_run(seed: object) -> None:
     seed_everything(seed, verbose=False)
 
 
-def build_trainer(config: DictConfig, folder: Path, callbacks: list[Callback], logger: list[Logger]) -> Trainer:
-    """Lightning's trainer with the settings of `config.trainer`."""
-    epochs = config.trainer.get("max_epochs", 1)
+def build_trainer(
+    settings: Mapping[str, Any], folder: Path, callbacks: list[Callback], logger: list[Logger]
+) -> Trainer:
+    """Lightning's trainer with `settings` as its arguments."""
+    epochs = settings.get("max_epochs", 1)
     if not isinstance(epochs, int) or epochs < 0:
         raise UserError(f"trainer.max_epochs must be a number of epochs, got {epochs}")
-    settings, hints = plain(config.trainer), typing.get_type_hints(Trainer.__init__)
-    for key, value in settings.items():
-        if key in hints and not registry.fits(value, hints[key]):
-            kind = inspect.formatannotation(hints[key]).replace("typing.", "")
-            raise UserError(f"trainer.{key}={value} is not of its type, {kind}")
     try:
         return Trainer(
-            **settings,
+            **registry.checked(Trainer.__init__, settings, "trainer."),
             default_root_dir=folder,
             callbacks=callbacks,
             logger=logger,
@@ -168,18 +161,6 @@ def run_folder() -> Path:
     folder = Path(HydraConfig.get().runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-
-
-def warn_of_photographs(prior: DictConfig) -> None:
-    """Of the config of the prior that ships, say that it knows no photographs."""
-    if prior.name == "tiny" and prior.path is None:
-        log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_KNOWS)
-
-
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A config as dicts, lists, names and numbers."""
-    values: Any = OmegaConf.to_container(config, resolve=True)
-    return {str(key): value for key, value in values.items()}
 
 
 def weights_fingerprint(networks: Sequence[nn.Module], sample: int = 1024) -> str:

@@ -18,11 +18,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from lp_framework import registry
-from lp_framework.api import image_batch, move
+from lp_framework.api import move, view_set
 from lp_framework.commands.building import (
-    build_solver,
-    model_origin,
+    Components,
     orderly_console,
     plain,
     run_folder,
@@ -43,7 +41,6 @@ from lp_framework.data.photographs import (
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.geometry import apply_relative_pose
-from lp_framework.solvers.base import ViewSets
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.cameras import cameras_figure
 from lp_framework.viz.html.run_page import write_run_page
@@ -89,12 +86,11 @@ def run(config: DictConfig) -> None:
     files = photograph_files(config.images)
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
 
-    warn_of_unused(config)
-    solver, checkpoint = build_solver(config)
+    components = Components(plain(config))
+    warn_of_unused(components)
+    solver, starts = components["solver"], components["start"]
     move(solver, device)
-    starts = registry.build("start", config.start)
-    views = torch.arange(len(files), device=device)[None]
-    view_sets = ViewSets(image_batch(prepared).to(device), views, ids=torch.zeros_like(views[:, 0]))
+    view_sets = view_set(prepared, device)
     ids = view_sets.pairs([0] * (len(files) - 1), range(1, len(files))).ids
     with shown_progress():
         solution = solver.solve_views(view_sets, starts.make(ids, config.seed)[None], config.seed)
@@ -115,19 +111,19 @@ def run(config: DictConfig) -> None:
         "energies": energies.tolist(),
         "valid": bool(solution.valid[0]),
         "seed": config.seed,
-        "checkpoint": str(checkpoint) if checkpoint else None,
+        "checkpoint": str(components.checkpoint) if components.checkpoint else None,
         "config": plain(config),
         "versions": versions(),
     }
     _write(folder, estimated, prepared, result)
-    _print(folder, estimated, None if checkpoint is None else model_origin(checkpoint, config.checkpoint))
-    warn_of_prior(config)
+    _print(folder, estimated)
+    warn_of_prior(components)
 
 
-def warn_of_prior(config: DictConfig) -> None:
+def warn_of_prior(components: Components) -> None:
     """Warn of a prior that knows no photographs where the solver's answer rests on it."""
-    if "prior" in registry.component_names(registry.get("solver", config.solver.name)):
-        warn_of_photographs(config.prior)
+    if "prior" in components.needs("solver"):
+        warn_of_photographs(components.settings["prior"])
 
 
 def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
@@ -169,7 +165,7 @@ def _write(folder: Path, views: Sequence[View], prepared: Sequence[Image.Image],
     save_figure(cameras_figure(poses.numpy(), pixels, numbers, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
 
 
-def _print(folder: Path, views: Sequence[View], model: str | None) -> None:
+def _print(folder: Path, views: Sequence[View]) -> None:
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("", no_wrap=True)
@@ -185,8 +181,6 @@ def _print(folder: Path, views: Sequence[View], model: str | None) -> None:
         else:
             table.add_row(view.file.name, "none")
     console.print(table)
-    if model is not None:
-        console.print(f"model:   {model}", soft_wrap=True)
     for what, path in (
         ("poses", "transforms.json, poses.csv"), ("COLMAP", "colmap"), ("images", "images"), ("picture", "cameras.png"),
     ):  # fmt: skip

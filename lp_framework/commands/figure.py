@@ -7,8 +7,7 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.console import Console
 
-from lp_framework import registry
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.evaluation.tables import write_json
 from lp_framework.figures.base import PaperFigure
@@ -22,15 +21,10 @@ def run(config: DictConfig) -> None:
     seed_run(config.seed)
     device = choose_device(config.accelerator)
     name = config.figure.name
-    wanted = registry.component_names(registry.get("figure", name))
-    components: dict[str, Any] = {}
-    if "data" in wanted:
-        components["data"] = build_data(config)
+    components = Components(plain(config))
+    figure: PaperFigure[Any] = components["figure"]
+    if "data" in components.needs("figure"):
         components["data"].evaluate_on("ordered", config.seed)  # only the test views
-    if "prior" in wanted:
-        components["prior"] = registry.build("prior", config.prior)
-    figure: PaperFigure[Any] = registry.build("figure", config.figure, **components)
-    if "data" in wanted:
         components["data"].prepare_data()
     for part in figure.networks():
         part.to(device)

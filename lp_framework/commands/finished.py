@@ -1,27 +1,26 @@
-"""Runs that have gone before: finished jobs of a sweep are skipped, runs that were stopped go on."""
+"""Runs that have gone before: finished jobs of a sweep are skipped, stopped runs are resumed."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from lp_framework import registry
-from lp_framework.commands.building import plain
 from lp_framework.errors import UserError
 from lp_framework.evaluation.journal import FOLDER, MOVABLE, compared_settings, unfinished
 from lp_framework.evaluation.runs import RESULT, differences
-from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint
 
 
-def is_finished(folder: Path, config: DictConfig) -> bool:
-    """Whether `folder` has the results of this very job of a sweep, which is then said in a line.
+def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | None) -> bool:
+    """Whether `folder` has the results of this very job of a sweep, with `settings` and the model of `checkpoint`;
+    if so, that is printed.
 
-    The results have to be of the same configuration, seeds included, and not older than the model's checkpoint. Raises
+    The results have to be of the same configuration, seeds included, and not older than the checkpoint. Raises
     `UserError` for other results: they are not overwritten. A job without a readable `results.json` is to be run.
     """
     if HydraConfig.get().mode != RunMode.MULTIRUN:
@@ -29,12 +28,11 @@ def is_finished(folder: Path, config: DictConfig) -> bool:
     file = folder / RESULT
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
-        settings = compared_settings(result["config"])
+        previous = compared_settings(result["config"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
-    checkpoint = _checkpoint(config)
-    before = {**settings, "checkpoint": result.get("checkpoint")}
-    now = {**compared_settings(json.loads(json.dumps(plain(config)))), "checkpoint": _text(checkpoint)}
+    before = {**previous, "checkpoint": result.get("checkpoint")}
+    now = {**compared_settings(json.loads(json.dumps(settings))), "checkpoint": checkpoint and str(checkpoint)}
     changed = differences(before, now)
     advice = "give another hydra.sweep.dir, or remove it"
     if changed:
@@ -47,7 +45,7 @@ def is_finished(folder: Path, config: DictConfig) -> bool:
 
 
 def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, Path | None]:
-    """The config and the checkpoint of the `eval` in `folder` that was stopped; it may go on on other devices.
+    """The config and the checkpoint of the stopped `eval` in `folder`; it may be resumed on other devices.
 
     Raises `UserError` where there is none, and for `overrides` of other settings.
     """
@@ -71,7 +69,7 @@ def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[
 def with_overrides(
     previous: DictConfig, config: DictConfig, overrides: Sequence[str], changeable: tuple[str, ...], saved: Path
 ) -> DictConfig:
-    """The config of a run that goes on: `previous`, of the file or folder `saved`, with what the command line changes.
+    """The config of a resumed run: `previous`, of the file or folder `saved`, with what the command line changes.
 
     Raises `UserError` where `overrides`, the command line's, have a key that does not begin as one of `changeable`.
     """
@@ -81,14 +79,3 @@ def with_overrides(
             raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
         OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
     return previous
-
-
-def _checkpoint(config: DictConfig) -> Path | None:
-    """The checkpoint that the job would use, None for a solver without a model."""
-    if "model" not in registry.component_names(registry.get("solver", config.solver.name)):
-        return None
-    return default_checkpoint() if config.checkpoint is None else find_checkpoint(config.checkpoint)
-
-
-def _text(checkpoint: Path | None) -> str | None:
-    return None if checkpoint is None else str(checkpoint)

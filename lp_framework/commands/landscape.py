@@ -15,9 +15,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from lp_framework import registry
 from lp_framework.commands import pair_landscape
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.cache import tracked
 from lp_framework.data.module import PairDataModule
@@ -74,8 +73,9 @@ def overview(config: DictConfig, folder: Path) -> None:
     """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
     grid = landscape_grid(config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees)
     device = choose_device(config.accelerator)
-    prior: Prior = registry.build("prior", config.prior).to(device)
-    data = build_data(config)
+    components = Components(plain(config))
+    prior: Prior = components["prior"].to(device)
+    data = components["data"]
     data.evaluate_on(config.protocol, config.seed)
     data.prepare_data()
     table = data.table(data.evaluation_split())

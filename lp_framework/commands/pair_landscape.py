@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from lp_framework import registry
-from lp_framework.api import image_batch, move
-from lp_framework.commands.building import build_data, build_solver, plain, versions, warn_of_photographs
+from lp_framework.api import move, view_set
+from lp_framework.commands.building import Components, plain, versions, warn_of_photographs
 from lp_framework.commands.device import choose_device
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import photograph_files, prepared_photographs
 from lp_framework.errors import UserError
 from lp_framework.evaluation.examples import EXAMPLES, Example, View, recording, save_examples
@@ -28,7 +28,6 @@ from lp_framework.evaluation.tables import write_arrays, write_json
 from lp_framework.figures.generated import generated_views
 from lp_framework.figures.shown_pairs import shown_pairs, words
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, wrap_angle
-from lp_framework.models.checkpoints import default_checkpoint, find_checkpoint, load_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution
@@ -90,16 +89,12 @@ def run(config: DictConfig, folder: Path) -> None:
         config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees
     )
     device = choose_device(config.accelerator)
-    shown = photographs(config, device) if config.images is not None else data_pair(config, device)
-    solver, checkpoint = build_solver(config)
+    components = Components(plain(config))
+    shown = photographs(config, device) if config.images is not None else data_pair(config, components["data"], device)
+    solver, prior = components["solver"], components["prior"].to(device)
     move(solver, device)
-    prior, model = getattr(solver, "prior", None), getattr(solver, "model", None)
-    if not isinstance(prior, Prior):
-        prior = registry.build("prior", config.prior).to(device)
-    if not isinstance(model, PoseModel) and shown.truth is not None:
-        checkpoint = default_checkpoint() if config.checkpoint is None else find_checkpoint(config.checkpoint)
-        model = load_model(checkpoint).to(device)
-    starts = registry.build("start", config.start).make(shown.pairs.ids, config.seed)
+    model = components["model"].to(device) if shown.truth is not None else None
+    starts = components["start"].make(shown.pairs.ids, config.seed)
     radius = torch.zeros(1) if shown.truth is None else shown.truth[2:]
     with shown_progress():
         energies = prior_landscapes(
@@ -120,17 +115,16 @@ def run(config: DictConfig, folder: Path) -> None:
             arrays["model_energy"] = field.energy[0].cpu().numpy()
         pictures += save_figure(fields_drawn(shown, model, starts, config.seed), folder / "fields")[:1]
     write_arrays(folder / "landscape.npz", arrays)
-    write_json(folder / "landscape.json", summary(config, shown, landscape, descent, checkpoint))
+    write_json(folder / "landscape.json", summary(config, shown, landscape, descent, components.checkpoint))
     save_examples(folder / "pictures" / EXAMPLES, [example(config, shown, landscape, descent)])
     report(config, folder, shown, landscape, descent, pictures)
 
 
-def data_pair(config: DictConfig, device: torch.device) -> Shown:
+def data_pair(config: DictConfig, data: PairDataModule, device: torch.device) -> Shown:
     """Two test views of the data set's `object`."""
     for key in ("reference", "query"):
         if not isinstance(config[key], int):
             raise UserError(f"{key} must be the number of a test view, got {config[key]}")
-    data = build_data(config)
     data.evaluate_on("ordered", config.seed)
     data.prepare_data()
     pair = shown_pairs(data, [str(config.object)], [(config.reference, config.query)], device)
@@ -151,9 +145,8 @@ def photographs(config: DictConfig, device: torch.device) -> Shown:
     if len(files) != 2:
         raise UserError(f"images: a landscape is of two files, got {len(files)}")
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
-    warn_of_photographs(config.prior)
-    index = torch.arange(2, device=device)
-    pairs = Pairs(image_batch(prepared).to(device), index[:1], index[1:], ids=index[:1])
+    warn_of_photographs(plain(config.prior))
+    pairs = view_set(prepared, device).pairs([0], [1])
     return Shown(f"{files[0].name} and {files[1].name}", [str(file) for file in files], pairs, None, None)
 
 

@@ -26,11 +26,10 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from yaml import YAMLError
 
-from lp_framework import registry
+from lp_framework import catalogue, registry
 from lp_framework.commands.building import (
-    DIVIDED,
     TRAINING,
-    build_data,
+    Components,
     build_trainer,
     orderly_console,
     plain,
@@ -49,6 +48,7 @@ from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.pictures import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
+OF_TRAINING = ("batch_pairs", "block", "validation_views", "seed")  # settings of data that an evaluation has no use for
 # Of Lightning's entries in a checkpoint, those without which no training goes on.
 TRAINING_STATE = {"epoch": int, "global_step": int, "loops": dict, "optimizer_states": list, "lr_schedulers": list}
 
@@ -73,8 +73,6 @@ def run(config: DictConfig) -> None:
         raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
     if checkpoint is not None and is_finished(folder, config, checkpoint):
         raise UserError(f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it")
-    if config.trainer.strategy == DIVIDED:
-        raise UserError(f"trainer.strategy={DIVIDED} divides the prior of an eval; models are trained whole, take ddp")
     if config.trainer.max_epochs == 0:
         raise UserError("trainer.max_epochs must be at least 1, got 0")
     if config.ema is not None and not (isinstance(config.ema, int | float) and 0 <= config.ema <= 1):
@@ -82,12 +80,11 @@ def run(config: DictConfig) -> None:
     if config.patience is not None and not (isinstance(config.patience, int) and config.patience >= 0):
         raise UserError(f"patience must be a number of epochs, or null for no early stop; got {config.patience}")
     seed_run(config.seed)
-    data = build_data(config)
-    backbone = registry.build("backbone", config.backbone)
-    model = registry.build("model", config.model, backbone=backbone)
+    components = Components(plain(config))
+    data, model = components["data"], components["model"]
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
-    trainer = build_trainer(config, folder, callbacks(config, folder, recipe), loggers(config, folder))
+    trainer = build_trainer(plain(config.trainer), folder, callbacks(config, folder, recipe), loggers(config, folder))
     if trainer.is_global_zero:
         write_text(folder / "config.yaml", OmegaConf.to_yaml(config))
         if checkpoint is not None:
@@ -188,11 +185,18 @@ def loggers(config: DictConfig, folder: Path) -> list[Logger]:
     return chosen
 
 
-def next_command(recipe: dict[str, Any], folder: str) -> str:
-    """How the trained model is used."""
-    if issubclass(registry.get("model", recipe["model"]["name"]), PoseModel):
-        return f"python -m lp_framework eval checkpoint={folder}"
-    return f"python -m lp_framework views prior.path={folder}"
+def next_command(recipe: Mapping[str, Any], folder: str, data: Mapping[str, Any]) -> str:
+    """The command that uses the trained model, on the data that it was trained on."""
+    if not issubclass(registry.get("model", recipe["model"]["name"]), PoseModel):
+        return f"python -m lp_framework views prior.path={folder}"
+    usual = catalogue.values("data", data["name"]) if data["name"] in catalogue.choices("data") else {}
+    changed = [
+        f"data.{key}={shlex.quote(str(value))}"
+        for key, value in data.items()
+        if key not in ("name", *OF_TRAINING) and value != usual.get(key)
+    ]
+    chosen = [] if data["name"] == "toy" else [f"data={data['name']}"]
+    return " ".join(["python -m lp_framework eval", f"checkpoint={folder}", *chosen, *changed])
 
 
 def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
@@ -227,4 +231,4 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
     for picture in save_training_picture(folder):
         console.print(f"picture: {picture}")
     console.print(f"page:    {write_run_page(folder, 'train')}")
-    console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)))}")
+    console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)), plain(config.data))}")

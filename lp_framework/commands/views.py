@@ -14,11 +14,11 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-from lp_framework import registry
 from lp_framework.api import image_batch
-from lp_framework.commands.building import build_data, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.cache import tracked
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
@@ -45,8 +45,9 @@ def run(config: DictConfig) -> None:
     latitudes, longitudes = angles(config.latitudes_degrees, config.longitudes)
     check_sampling(config.steps, config.guidance, config.eta)
     device = choose_device(config.accelerator)
-    source = photograph(config) if config.image is not None else data_view(config)
-    prior: Prior = registry.build("prior", config.prior).to(device)
+    components = Components(plain(config))
+    source = photograph(config) if config.image is not None else data_view(config, components["data"])
+    prior: Prior = components["prior"].to(device)
     (folder / FOLDER).mkdir(exist_ok=True)
     save_png(folder / "source.png", source.image)
 
@@ -117,9 +118,8 @@ def photograph(config: DictConfig) -> Source:
     return Source(file, file.name, image)
 
 
-def data_view(config: DictConfig) -> Source:
+def data_view(config: DictConfig, data: PairDataModule) -> Source:
     """The first test view of the data set's `object`, as it is."""
-    data = build_data(config)
     data.evaluate_on("ordered", config.seed)
     data.prepare_data()
     table = data.table("test")

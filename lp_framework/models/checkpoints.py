@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,13 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from lp_framework import registry
-from lp_framework.errors import UserError
-from lp_framework.models.model_folder import RECIPE, WEIGHTS, is_recipe, read_model_folder
+from lp_framework.errors import UserError, one_line, optional_import
+from lp_framework.models.model_folder import CONFIG, RECIPE, WEIGHTS, is_recipe, read_model_folder
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import TrainedModule
 
 FOLDER = "checkpoints"
+LATEST = "latest"
 LAST, BEST = "last.ckpt", "best.ckpt"
 SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
 
@@ -58,11 +60,26 @@ def _weights_in(checkpoint: Mapping[str, Any]) -> bool:
     )
 
 
-def find_checkpoint(path: str | Path) -> Path:
-    """The file that `path` means: itself, a run's best (else last) checkpoint, the weights of a model's folder."""
-    path = Path(path)
-    if not path.is_dir():
-        return path
+def find_checkpoint(name: str | Path) -> Path:
+    """The file of weights that `checkpoint=` means.
+
+    `name` is that of weights that ship (`score`), `latest` (the latest training run below the working directory), a
+    checkpoint file, a run's folder (its best, else its last checkpoint), a folder that `lp convert` wrote, or the id of
+    such a folder on the Hugging Face hub. Raises `UserError` where there is none.
+    """
+    if (SHIPPED / str(name) / WEIGHTS).is_file():
+        return SHIPPED / str(name) / WEIGHTS
+    if name == LATEST:
+        return latest_checkpoint()
+    path = Path(name)
+    if path.is_dir():
+        return _in_folder(path)
+    if re.fullmatch(r"[\w.-]+/[\w.-]+", str(name)) and not (path.exists() or path.parent.is_dir()):
+        return _from_hub(str(name))
+    return path
+
+
+def _in_folder(path: Path) -> Path:
     if (path / WEIGHTS).is_file():
         return path / WEIGHTS
     for folder in (path / FOLDER, path):
@@ -72,19 +89,34 @@ def find_checkpoint(path: str | Path) -> Path:
     raise UserError(f"{path}: holds no {FOLDER}/{BEST} or {LAST}; give a run's folder or a checkpoint file")
 
 
-def default_checkpoint(runs: str | Path = "runs/train") -> Path:
-    """The latest training run's pose model below the working directory; where there is none, the one that ships.
+def _from_hub(name: str) -> Path:
+    hub = optional_import("huggingface_hub", "zero123")
+    try:
+        return Path(hub.snapshot_download(name, allow_patterns=[WEIGHTS, CONFIG])) / WEIGHTS
+    except (OSError, ValueError) as error:  # the hub's errors are of these
+        raise UserError(f"checkpoint={name}: is neither a file or folder nor on the hub ({one_line(error)})") from error
+
+
+def latest_checkpoint(runs: str | Path = "runs/train") -> Path:
+    """The latest training run's pose model below the working directory; `UserError` where there is none.
 
     Runs of priors are passed over, and those that diverged.
     """
     found = sorted(Path(runs).glob(f"*/{FOLDER}/{LAST}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in found:
-        best = find_checkpoint(file.parents[1])
+        best = _in_folder(file.parents[1])
         checkpoint = read_checkpoint(best)
         finite = all(each.isfinite().all() for each in checkpoint["state_dict"].values())
         if finite and issubclass(registry.get("model", checkpoint[RECIPE]["model"]["name"]), PoseModel):
             return best
-    return SHIPPED / "score" / WEIGHTS
+    raise UserError(f"checkpoint={LATEST}: there is no training run of a model in {Path(runs).absolute()}")
+
+
+def describe(checkpoint: Path) -> str:
+    """A checkpoint in words, for the terminal."""
+    if checkpoint.is_relative_to(SHIPPED):
+        return f"{checkpoint.parent.name}, which ships with lp_framework (trained on the twelve embedded objects)"
+    return str(checkpoint)
 
 
 def load_model(path: str | Path) -> PoseModel:

@@ -13,7 +13,6 @@ from scipy.ndimage import binary_fill_holes
 from torch import Tensor, nn
 
 from lp_framework.errors import UserError
-from lp_framework.registry_sources import first_line
 
 WEIGHTS = {  # hub ids of the learned matchers' published weights
     "lightglue": "ETH-CVG/lightglue_superpoint",
@@ -64,7 +63,7 @@ def require(module: str, user: str, package: str) -> ModuleType:
 
 def weights_error(network: str, source: str, error: Exception) -> UserError:
     """What to raise where the weights of a network could not be loaded."""
-    reason = first_line(str(error)) or type(error).__name__
+    reason = str(error).strip().partition("\n")[0] or type(error).__name__
     return UserError(
         f"{source}: the weights of {network} cannot be had from there ({reason}); "
         "give solver.weights= a local path or an id of the Hugging Face hub"
