@@ -28,7 +28,7 @@ def double(values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference" / "ifusion_poses.json"
+REFERENCE = Path(__file__).parent / "data" / "reference" / "ifusion_poses.json"
 BATCHES = [(), (5,), (2, 3)]
 law = settings(max_examples=60, deadline=None, derandomize=True)
 twists = st.tuples(*[st.floats(-3, 3)] * 6).map(double)
@@ -123,7 +123,6 @@ def test_errors_are_differentiable_and_finite_where_they_are_zero() -> None:
     assert torch.equal(gradient, torch.zeros(3, dtype=torch.float64))
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason="the published reference poses are not beside the project")
 def test_against_ifusion_errors() -> None:
     # Published iFusion code, float32; its arccos multiplies the rounding of the trace by 1 / sin(angle).
     reference = json.loads(REFERENCE.read_text())

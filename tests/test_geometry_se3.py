@@ -30,7 +30,7 @@ def double(values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-GOLDEN = Path(__file__).parents[1].parent / "shared" / "reference" / "zero123_tiny" / "golden.npz"
+GOLDEN = Path(__file__).parent / "data" / "reference" / "zero123_tiny" / "golden.npz"
 BATCHES = [(), (5,), (2, 3)]
 # Zero, both sides of the change from series to closed form (1), up to nearly a half turn.
 ANGLES = [0.0, 1e-200, 1e-12, 1e-6, 1e-3, 0.3, 0.999999, 1.0, 1.000001, 2.0, 3.1, math.pi - 1e-4, math.pi - 1e-7]
@@ -272,7 +272,6 @@ def test_rotations_are_known_and_what_is_none(xi: Tensor) -> None:
 # iFusion
 
 
-@pytest.mark.skipif(not GOLDEN.exists(), reason="the published reference trajectory is not beside the project")
 def test_ifusion_ends_where_its_twist_leads() -> None:
     # golden.npz: published iFusion loop from (0, 90 degrees, radius 1); T = T0 @ exp(xi), latitude down-positive,
     # distance = 0.8 sin(norm - 1). Float32 on CPU.

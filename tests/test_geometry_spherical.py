@@ -30,7 +30,7 @@ def double(values: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference" / "ifusion_poses.json"
+REFERENCE = Path(__file__).parent / "data" / "reference" / "ifusion_poses.json"
 DTYPES = [torch.float32, torch.float64]
 BATCHES = [(), (5,), (2, 3)]
 TURN = 2 * math.pi
@@ -253,7 +253,6 @@ def test_ifusion_round_trip(pose: Tensor) -> None:
     assert (again - pose)[[0, 2]].abs().max() < 1e-14 and angle_gap(again[1], pose[1]) < 1e-14
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason="the published reference poses are not beside the project")
 def test_against_ifusion_cameras() -> None:
     # Published iFusion code, float32: six to seven digits.
     reference = json.loads(REFERENCE.read_text())

@@ -1,6 +1,6 @@
-"""Zero123 against the published implementations: every array of ../shared/reference/zero123_tiny/golden.npz.
+"""Zero123 against the published implementations: every array of data/reference/zero123_tiny/golden.npz.
 
-Source of the numbers: ../shared/reference/README.md (published iFusion and Zero123 code, float32 on a CPU).
+Source of the numbers: data/reference/README.md (published iFusion and Zero123 code, float32 on a CPU).
 """
 
 from __future__ import annotations
