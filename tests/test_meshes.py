@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scanned_objects import write_bottle, write_mug
 
 from lp_framework.data.meshes import (
     NEUTRAL_GREY,
@@ -19,8 +20,6 @@ from lp_framework.data.meshes import (
     surfaces,
 )
 from lp_framework.errors import UserError
-
-HOUSEHOLD = Path(__file__).parents[1].parent / "shared" / "meshes" / "household"
 
 
 def coloured_box(extents=(1.0, 1.0, 1.0), colour=(200, 30, 30, 255)) -> trimesh.Trimesh:
@@ -118,19 +117,15 @@ def test_truncated_glb(tmp_path):
         load_scene(path)
 
 
-@pytest.mark.skipif(not HOUSEHOLD.is_dir(), reason="the household meshes are not beside this checkout")
-def test_household_meshes_load_with_their_colours():
-    paths = sorted(HOUSEHOLD.glob("*.glb"))
-    assert paths
-    for path in paths:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            scene = load_scene(path)
-        corners = corners_of(scene)
-        assert np.ptp(corners, axis=0).max() == pytest.approx(1, abs=1e-5), path.name
-        for surface in surfaces(scene):
-            norms = np.linalg.norm(surface.normals, axis=1)
-            assert np.isfinite(norms).all() and (norms > 0.99).mean() > 0.99, path.name
+@pytest.mark.parametrize("write_object", [write_mug, write_bottle])
+def test_textured_objects_load_with_their_colours(tmp_path, write_object):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load_scene(write_object(tmp_path))
+    assert np.ptp(corners_of(scene), axis=0).max() == pytest.approx(1, abs=1e-5)
+    for surface in surfaces(scene):
+        norms = np.linalg.norm(surface.normals, axis=1)
+        assert np.isfinite(norms).all() and (norms > 0.99).mean() > 0.99
 
 
 # ---------------------------------------------------------------- colours

@@ -1,6 +1,6 @@
 import json
 import math
-import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +17,25 @@ from lp_framework.evaluation import idpose_results
 from lp_framework.evaluation.idpose_results import evaluate_idpose, read_idpose_results
 from lp_framework.geometry import camera_to_world, relative_pose, view_pose
 
-PUBLISHED = Path(__file__).parents[1].parent / "shared" / "samples" / "omni3d"
+PUBLISHED = Path(__file__).parent / "data" / "idpose.json"  # cameras and results of ID-Pose's published example
 POSES = {"011": (0.25, 1.0, 4.0), "001": (0.1, 3.0, 4.0), "077": (-0.2, 5.5, 4.2)}
 TO_Z_UP = torch.tensor([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 
 
-def write_omni3d(root: Path, name: str = "dinosaur_002", size: int = 20) -> Path:
-    """An object in ID-Pose's layout, its cameras at `POSES`."""
-    for folder in ("images", "poses"):
-        (root / name / folder).mkdir(parents=True)
-    for view, pose in POSES.items():
+def write_images(folder: Path, views: Iterable[str], size: int = 20) -> None:
+    """The folders of an object in ID-Pose's layout, an image for each of the views."""
+    for each in ("images", "poses"):
+        (folder / each).mkdir(parents=True)
+    for view in views:
         pixels = np.zeros((size, size, 4), np.uint8)
         pixels[4:-4, 4:-4] = [200, int(view), 30, 255]
-        Image.fromarray(pixels).save(root / name / "images" / f"{view}.png")
+        Image.fromarray(pixels).save(folder / "images" / f"{view}.png")
+
+
+def write_omni3d(root: Path, name: str = "dinosaur_002") -> Path:
+    """An object in ID-Pose's layout, its cameras at `POSES`."""
+    write_images(root / name, POSES)
+    for view, pose in POSES.items():
         np.save(root / name / "poses" / f"{view}.npy", TO_Z_UP @ camera_to_world(torch.tensor(pose).double()))
     return root
 
@@ -245,10 +251,20 @@ def test_a_folder_without_results(root, tmp_path, capsys):
     assert "holds no results of ID-Pose" in capsys.readouterr().err
 
 
-def test_the_published_results_with_zero123_xl(capsys):
-    if not PUBLISHED.is_dir():
-        pytest.skip(f"{PUBLISHED} is not there")
-    result = evaluate_idpose(PUBLISHED, PUBLISHED)
+@pytest.fixture
+def published(tmp_path) -> Path:
+    """ID-Pose's published example: its cameras and results, with drawn images."""
+    root = tmp_path / "omni3d"
+    for name, each in json.loads(PUBLISHED.read_text()).items():
+        write_images(root / name, each["poses"])
+        for view, camera in each["poses"].items():
+            np.save(root / name / "poses" / f"{view}.npy", np.array(camera))
+        (root / each["results"]).write_text(json.dumps(each["content"]))
+    return root
+
+
+def test_the_published_results_with_zero123_xl(published, capsys):
+    result = evaluate_idpose(published, published)
     assert result["pairs"] == 9 and sorted(result["per_object"]) == ["dinosaur_002", "house_001", "ornaments_001"]
     metrics = result["metrics"]
     assert [metrics[key] * 9 for key in ("R@5", "R@15", "R@30")] == pytest.approx([3, 4, 4])
@@ -256,27 +272,24 @@ def test_the_published_results_with_zero123_xl(capsys):
     assert metrics["rotation_error"] == pytest.approx(5.903, abs=1e-3)
     assert metrics["translation_error"] == pytest.approx(0.2071, abs=1e-4)
     # The file has its own account of the truth.
-    found = read_idpose_results(PUBLISHED, omni3d_objects(PUBLISHED))
-    for file in PUBLISHED.glob("*.json"):
+    found = read_idpose_results(published, omni3d_objects(published))
+    for file in published.glob("*.json"):
         for view, entry in json.loads(file.read_text())["obs"].items():
             if "gt_rel_sph" in entry:
-                name = next(name for name in omni3d_objects(PUBLISHED) if name in file.name)
-                cameras = omni3d_cameras(PUBLISHED, name)
+                name = next(name for name in omni3d_objects(published) if name in file.name)
+                cameras = omni3d_cameras(published, name)
                 row = list(zip(found.objects, found.queries, strict=True)).index((name, view))
                 truth = relative_pose(view_pose(cameras[found.references[row]]), view_pose(cameras[view]))
                 polar, azimuth, _ = entry["gt_rel_sph"]
                 assert truth[:2].tolist() == pytest.approx([-polar, azimuth], abs=1e-6)
-    assert idpose_results.main([str(PUBLISHED), str(PUBLISHED)]) == 0
+    assert idpose_results.main([str(published), str(published)]) == 0
     assert "ID-Pose, 9 pairs" in capsys.readouterr().out
 
 
-def test_the_published_views_load(tmp_path):
-    if not PUBLISHED.is_dir():
-        pytest.skip(f"{PUBLISHED} is not there")
-    data = Omni3DData(str(PUBLISHED), str(tmp_path / "views"), cache=str(tmp_path / "cache"), image_size=32)
+def test_the_published_views_load(published, tmp_path):
+    data = Omni3DData(str(published), str(tmp_path / "views"), cache=str(tmp_path / "cache"), image_size=32)
     data.evaluate_on("ordered", 0)
     data.prepare_data()
     table = data.table("test")
     assert table.counts == [4, 4, 4] and len(table.pairs("ordered")) == 36
     torch.testing.assert_close(table.poses[:, 2], torch.full((12,), 1.85, dtype=torch.float64), rtol=0, atol=1e-6)
-    shutil.rmtree(tmp_path / "views")

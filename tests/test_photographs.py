@@ -31,8 +31,6 @@ from lp_framework.data.photographs import (
 )
 from lp_framework.errors import UserError
 
-SAMPLES = Path(__file__).parents[1].parent / "shared" / "samples" / "photos"
-
 
 def object_box(image: Image.Image) -> tuple[int, int, int, int]:
     box = Image.fromarray((np.asarray(image)[..., 3] >= 128).astype(np.uint8) * 255).getbbox()
@@ -391,15 +389,34 @@ def test_what_can_go_wrong_with_background_removal(rembg, monkeypatch: pytest.Mo
         prepare(Image.new("RGB", (60, 40)), "a", remover=BackgroundRemover())
 
 
-# ---------------------------------------------------------------- real photographs
+# ---------------------------------------------------------------- cut-outs as they are published
 
 
-@pytest.mark.skipif(not SAMPLES.is_dir(), reason="the sample photographs are not part of the project")
-@pytest.mark.parametrize(
-    "name", ["cat/0.png", "sorter/1.png", "chair_photo/images/000.png", "toyduck_photo/images/004.png"]
-)
-def test_published_cut_outs_are_framed(name: str):
-    prepared = prepare(read_image(SAMPLES / name), name)
+def soft(left: int, top: int) -> NDArray[np.uint8]:
+    """iFusion's: background of opacity 0, edges of all opacities."""
+    return np.array(placed(drawn(200, 270), left, top, 512, 512))
+
+
+def with_few_opacities(left: int, top: int) -> NDArray[np.uint8]:
+    """A mask that has been drawn at twice the size."""
+    image = soft(left, top)
+    image[..., 3] = np.minimum(np.round(image[..., 3] / 64) * 64, 255)
+    return image
+
+
+def half_opaque(left: int, top: int) -> NDArray[np.uint8]:
+    """ID-Pose's: black background of opacity 127, edges of those above."""
+    image = soft(left, top)
+    image[image[..., 3] == 0] = 0
+    image[..., 3] = 127 + image[..., 3] // 2
+    return image
+
+
+@pytest.mark.parametrize("cut_out_as", [soft, with_few_opacities, half_opaque])
+@pytest.mark.parametrize("place", [(40, 60), (250, 200)])
+def test_published_kinds_of_cut_outs_are_framed(cut_out_as, place: tuple[int, int], tmp_path: Path):
+    file = saved(Image.fromarray(cut_out_as(*place)), tmp_path / "000.png")
+    prepared = prepare(read_image(file), file.name)
     left, top, right, bottom = object_box(prepared)
     assert abs(max(right - left, bottom - top) - EXTENT) <= 2 and abs(left + right - SIZE) <= 2
     corners = np.asarray(prepared)[[0, 0, -1, -1], [0, -1, 0, -1], 3]

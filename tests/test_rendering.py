@@ -13,6 +13,7 @@ import torch
 import trimesh
 from filelock import FileLock
 from PIL import Image
+from scanned_objects import write_bottle, write_mug
 
 from lp_framework.data.meshes import MeshObject, load_scene, normalise
 from lp_framework.data.rendering import auto, pyrender_renderer
@@ -24,7 +25,6 @@ from lp_framework.data.rendering.views import ViewProtocol, render_object, rende
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, to_ifusion, view_pose
 
-HOUSEHOLD = Path(__file__).parents[1].parent / "shared" / "meshes" / "household"
 FIELD_OF_VIEW = 49.1  # degrees
 
 
@@ -224,20 +224,18 @@ def test_downsampling_takes_the_mean_with_premultiplied_alpha():
 # ---------------------------------------------------------------- agreement of the renderers
 
 SCENES = {
-    "textured": lambda: trimesh.Scene(textured_box()),
-    "vertex_coloured": lambda: trimesh.Scene(vertex_coloured_torus()),
-    "face_coloured": lambda: trimesh.Scene(painted_box()),
-    "scanned_mug": lambda: load_scene(HOUSEHOLD / "red_coffee_mug.glb"),
-    "painted_sheets": lambda: load_scene(HOUSEHOLD / "wine_bottle.glb"),
+    "textured": lambda _: trimesh.Scene(textured_box()),
+    "vertex_coloured": lambda _: trimesh.Scene(vertex_coloured_torus()),
+    "face_coloured": lambda _: trimesh.Scene(painted_box()),
+    "scanned_mug": lambda folder: load_scene(write_mug(folder)),
+    "painted_sheets": lambda folder: load_scene(write_bottle(folder)),
 }
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_renderers_agree_on_silhouette_and_colour(name):
+def test_renderers_agree_on_silhouette_and_colour(name, tmp_path):
     open_gl()
-    if name in ("scanned_mug", "painted_sheets") and not HOUSEHOLD.is_dir():
-        pytest.skip("the household meshes are not beside this checkout")
-    scene = normalise(SCENES[name]())
+    scene = normalise(SCENES[name](tmp_path))
     views = cameras((20, 30, 1.5), (-25, 160, 1.9))
     by_gl, by_rays = (each.render(scene, views, 96, FIELD_OF_VIEW) for each in (PyrenderRenderer(), RaycastRenderer()))
     inside_gl, inside_rays = by_gl[..., 3] >= 128, by_rays[..., 3] >= 128
