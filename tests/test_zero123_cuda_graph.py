@@ -14,7 +14,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 from lp_framework.benchmarks.second_stage import NARROW
-from lp_framework.errors import UserError
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.zero123 import cuda_graph
 from lp_framework.priors.zero123.chunks import Chunks
@@ -160,11 +159,6 @@ def test_recordings_are_given_back_before_a_batch_is_halved():
 def test_without_a_gpu_the_setting_changes_nothing():
     one, other = (energies_and_slopes(prior_of(cuda_graph=each), 2, 0) for each in (True, False))
     assert all(map(torch.equal, one, other))
-
-
-def test_a_recorded_prior_cannot_be_divided():
-    with pytest.raises(UserError, match=r"prior.cuda_graph=true and trainer.strategy=model_parallel"):
-        prior_of(cuda_graph=True).shard(None)
 
 
 @pytest.mark.gpu

@@ -21,7 +21,6 @@ from lp_framework.geometry import (
     rotation_error,
     translation_error,
 )
-from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Solution, Solver, pairs_of
 from lp_framework.solvers.starts import Starts
 
@@ -42,21 +41,6 @@ class Evaluation(LightningModule):
         # Registered, so that Lightning moves the networks of the solver to the device.
         self.networks = torch.nn.ModuleList(solver.networks())
         self.costs = Costs()
-
-    def configure_model(self) -> None:
-        """Divide the prior among the processes, if the strategy is `model_parallel`."""
-        if self.device_mesh is None:
-            return
-        try:
-            priors = [each for each in self.networks if isinstance(each, Prior)]
-            if not priors:
-                raise UserError("trainer.strategy=model_parallel divides a prior, and this solver has none")
-            for prior in priors:
-                prior.shard(self.device_mesh)
-        except UserError:
-            if self.trainer.is_global_zero:
-                raise
-            raise SystemExit(1) from None  # said once
 
     def setup(self, stage: str) -> None:
         """The objects are known once the data are prepared."""

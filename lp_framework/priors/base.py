@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.distributed.device_mesh import DeviceMesh
 
 from lp_framework.errors import UserError
 
@@ -76,13 +75,6 @@ class Prior(nn.Module, ABC):
         `guidance` is the scale of classifier-free guidance (1: none), `eta` the share of fresh noise (0: none). All
         views of a call have the same draws: they differ by source and pose alone.
         """
-
-    def shard(self, mesh: DeviceMesh) -> None:
-        """Divide the weights among processes: over the last dimension of a mesh `[replicas, shards]`.
-
-        From then on all processes of a shard group have to make the same calls, with batches of whatever size.
-        """
-        raise UserError(f"{type(self).__name__} cannot be divided among processes; leave trainer.strategy as it is")
 
     def train(self, mode: bool = True) -> Prior:
         """As every module, but a prior stays in evaluation mode."""

@@ -6,9 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, distributed
-
-from lp_framework.errors import UserError
+from torch import Tensor
 
 _Result = TypeVar("_Result")
 
@@ -17,19 +15,14 @@ class Chunks:
     """Runs a function on slices of a batch, at most `size` long (None: all of it).
 
     When a GPU runs out of memory, `release` gives back what it can and says whether that was anything; else the size is
-    halved for good. Then the rest of the batch is tried again. Not so where the networks are divided among the
-    processes of `group`: there all have to run the function equally often, and one with fewer slices than others runs
-    its last one again.
+    halved for good. Then the rest of the batch is tried again.
     """
 
     def __init__(self, size: int | None, release: Callable[[], bool] | None = None) -> None:
         self.size, self.release = size, release
-        self.group: distributed.ProcessGroup | None = None
 
     def run(self, function: Callable[[slice], _Result], batch: int) -> list[_Result]:
         """The results for `slice(0, size)`, `slice(size, 2 * size)`, ... of a batch."""
-        if self.group is not None:
-            return self._run_together(function, batch, self.group)
         results: list[_Result] = []
         start = 0
         while start < batch:
@@ -46,30 +39,6 @@ class Chunks:
                 continue
             torch.cuda.empty_cache()  # here the exception, and with it the tensors of the failed attempt, are gone
         return results
-
-    def _run_together(
-        self, function: Callable[[slice], _Result], batch: int, group: distributed.ProcessGroup
-    ) -> list[_Result]:
-        size = self.size or batch
-        parts = [slice(start, min(start + size, batch)) for start in range(0, batch, size)]
-        rounds = self._most(len(parts), group)
-        try:
-            results = [function(part) for part in parts]
-            for _ in range(len(parts), rounds):
-                function(parts[-1])
-        except torch.cuda.OutOfMemoryError as error:
-            raise UserError(
-                f"the GPU has no memory for {size} samples at once; set a smaller prior.max_batch"
-            ) from error
-        return results
-
-    def _most(self, count: int, group: distributed.ProcessGroup) -> int:
-        """The largest count among the processes."""
-        if self.size is None:  # a batch is one slice everywhere
-            return count
-        counts: list[int] = [0] * distributed.get_world_size(group)
-        distributed.all_gather_object(counts, count, group)
-        return max(counts)
 
 
 class EnergyAndSlope(torch.autograd.Function):

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributed.device_mesh import DeviceMesh
 from torch.nn import functional
 
 from lp_framework.errors import UserError
@@ -84,20 +83,6 @@ class Zero123Prior(Prior):
         if self.replayed is not None:
             self.replayed.forget()
         return super()._apply(function, recurse)
-
-    def shard(self, mesh: DeviceMesh) -> None:
-        """See `Prior.shard`: PyTorch's FSDP, block by block; a block's weights are gathered while it computes."""
-        from torch.distributed.fsdp import fully_shard  # not in every build of PyTorch
-
-        for setting, chosen in (("channels_last", self.channels_last), ("cuda_graph", self.replayed)):
-            if chosen:
-                raise UserError(f"prior.{setting}=true and trainer.strategy=model_parallel do not go together")
-        unet, encoder = self.unet, self.image_encoder.vision_model.encoder
-        for block in (*unet.down_blocks, unet.mid_block, *unet.up_blocks, *encoder.layers):
-            fully_shard(block, mesh=mesh)
-        for network in (unet, self.image_encoder, self.vae.encoder, self.vae.decoder):
-            fully_shard(network, mesh=mesh)
-        self.chunks.group = self.image_chunks.group = mesh.get_group(mesh.ndim - 1)
 
     # ------------------------------------------------------------ images
 
