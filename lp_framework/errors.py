@@ -28,11 +28,21 @@ def one_line(error: BaseException) -> str:
     return " ".join(line for line in lines if line and not line.startswith(("full_key:", "object_type=", "See https:")))
 
 
-def optional_import(module: str, extra: str) -> ModuleType:
-    """A module of an optional package; where it is missing, `UserError` with the extra that installs it."""
+def check_settings(group: str, *settings: tuple[str, object, bool, str]) -> None:
+    """`UserError` for the first of a group's settings (name, value, whether it fits, what is wanted) that does not fit.
+
+    >>> check_settings("solver", ("steps", 0, False, "at least 1"))
+    Traceback (most recent call last):
+    lp_framework.errors.UserError: solver.steps must be at least 1, got 0
+    """
+    for name, value, fits, wanted in settings:
+        if not fits:
+            raise UserError(f"{group}.{name} must be {wanted}, got {value}")
+
+
+def optional_import(module: str, user: str, install: str) -> ModuleType:
+    """A module of an optional package; without it a `UserError` that names its `user` and says how to `install` it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise UserError(
-            f"the Python package '{error.name}' is not installed: pip install 'lp_framework[{extra}]'"
-        ) from error
+        raise UserError(f"{user} needs the Python package '{error.name}', which is not installed: {install}") from error

@@ -234,7 +234,7 @@ def test_it_works_in_inference_mode():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"refinement_steps": -1}, r"solver\.refinement_steps must not be negative, got -1"),
+        ({"refinement_steps": -1}, r"solver\.refinement_steps must be at least 0, got -1"),
         ({"timesteps": []}, r"solver\.timesteps must be one or more of 0 to 999, got \[\]"),
         ({"timesteps": [20, 1000]}, r"solver\.timesteps must be one or more of 0 to 999, got \[20, 1000\]"),
         ({"damping": 0.0}, r"solver\.damping must be positive, got 0\.0"),

@@ -300,7 +300,7 @@ def test_an_alpha_that_does_not_converge_is_refused(alpha):
 
 
 def test_negative_iterations_are_refused():
-    with pytest.raises(UserError, match=r"solver\.iterations must not be negative, got -1"):
+    with pytest.raises(UserError, match=r"solver\.iterations must be at least 0, got -1"):
         Langevin(Exact(), iterations=-1)
 
 

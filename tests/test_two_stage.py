@@ -162,7 +162,7 @@ def test_a_start_where_either_stage_fails_stops_alone_and_is_reported(stage):
 
 
 def test_bad_settings_are_named():
-    with pytest.raises(UserError, match=r"solver.refinement_steps must not be negative, got -1"):
+    with pytest.raises(UserError, match=r"solver.refinement_steps must be at least 0, got -1"):
         TwoStage(ExactModel(), ExactPrior(), refinement_steps=-1)
     with pytest.raises(UserError, match=r"solver.first_timestep must be below the prior's 1000 timesteps, got 2000"):
         TwoStage(ExactModel(), ExactPrior(), first_timestep=2000)

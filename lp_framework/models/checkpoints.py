@@ -90,7 +90,7 @@ def _in_folder(path: Path) -> Path:
 
 
 def _from_hub(name: str) -> Path:
-    hub = optional_import("huggingface_hub", "zero123")
+    hub = optional_import("huggingface_hub", f"checkpoint={name}", "pip install 'lp_framework[zero123]'")
     try:
         return Path(hub.snapshot_download(name, allow_patterns=[WEIGHTS, CONFIG])) / WEIGHTS
     except (OSError, ValueError) as error:  # the hub's errors are of these

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from lp_framework.data.pairs import PairBatch
+from lp_framework.errors import check_settings
 from lp_framework.keyed_random import keyed_normal, keyed_uniform
 from lp_framework.models.backbones import Backbone
 from lp_framework.models.networks import PoseNetwork
 from lp_framework.models.objectives import NoisedPose, PoseKernel
 from lp_framework.models.pair_mean import PairMean
-from lp_framework.models.trained_module import TrainedModule, check_settings
+from lp_framework.models.trained_module import TrainedModule
 from lp_framework.models.view_head import ViewHead
 from lp_framework.registry import register
 
@@ -61,6 +62,7 @@ class PoseModel(TrainedModule):
     ) -> None:
         super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
         check_settings(
+            "model",
             ("hidden", hidden, hidden >= 1, "at least 1"),
             ("layers", layers, layers >= 0, "at least 0"),
             ("frequencies", frequencies, frequencies >= 1, "at least 1"),

@@ -10,7 +10,7 @@ from lightning import LightningModule
 
 from lp_framework.data.module import FeatureExtractor
 from lp_framework.data.pairs import PairBatch
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.models.backbones import Backbone
 
 WEIGHTS = {"state_dict", "current_model_state"}  # where a checkpoint has weights; the second is of a moving average
@@ -30,6 +30,7 @@ class TrainedModule(LightningModule):
     ) -> None:
         super().__init__()
         check_settings(
+            "model",
             ("learning_rate", learning_rate, learning_rate >= 0, "at least 0"),
             ("weight_decay", weight_decay, weight_decay >= 0, "at least 0"),
         )
@@ -103,10 +104,3 @@ class TrainedModule(LightningModule):
         trunk = self.backbone.trunk_module()
         prefix = next(name for name, module in self.named_modules() if module is trunk)
         return [f"{prefix}.{key}" for key in trunk.state_dict()]
-
-
-def check_settings(*settings: tuple[str, float, bool, str]) -> None:
-    """`UserError` for the first setting (name, value, whether it fits, what is wanted) that does not fit."""
-    for name, value, fits, wanted in settings:
-        if not fits:
-            raise UserError(f"model.{name} must be {wanted}, got {value}")

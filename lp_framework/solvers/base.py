@@ -27,8 +27,7 @@ class Pairs:
     ids: Tensor
 
     def __post_init__(self) -> None:
-        if self.images.ndim != 4 or self.images.shape[1] != 3:
-            raise UserError(f"images must be [I, 3, H, W], got {list(self.images.shape)}")
+        _check_images(self.images)
         if not (self.reference.shape == self.query.shape == self.ids.shape and self.reference.ndim == 1):
             shapes = [list(each.shape) for each in (self.reference, self.query, self.ids)]
             raise UserError(f"reference, query and ids must be [B] each, got {shapes}")
@@ -55,14 +54,18 @@ class ViewSets:
     ids: Tensor
 
     def __post_init__(self) -> None:
-        if self.images.ndim != 4 or self.images.shape[1] != 3:
-            raise UserError(f"images must be [I, 3, H, W], got {list(self.images.shape)}")
+        _check_images(self.images)
         if self.views.ndim != 2 or self.views.shape[1] < 2 or self.ids.shape != self.views.shape[:1]:
             shapes = [list(each.shape) for each in (self.views, self.ids)]
             raise UserError(f"views must be [S, V] with V >= 2 and ids [S], got {shapes}")
 
     def __len__(self) -> int:
         return len(self.views)
+
+    def with_first(self) -> Pairs:
+        """The pairs of each set's first image, as reference, with its others: S x (V - 1), those of a set together."""
+        views = self.views.shape[1]
+        return self.pairs([0] * (views - 1), range(1, views))
 
     def pairs(self, reference: Sequence[int], query: Sequence[int]) -> Pairs:
         """P pairs of places within a set, for every set: S x P problems, those of a set together.
@@ -73,6 +76,11 @@ class ViewSets:
         ids = keyed_bits(self.ids[:, None], *places, count=1)
         chosen = self.views[:, places]  # [S, 2, P]
         return Pairs(self.images, chosen[:, 0].flatten(), chosen[:, 1].flatten(), ids.flatten())
+
+
+def _check_images(images: Tensor) -> None:
+    if images.ndim != 4 or images.shape[1] != 3:
+        raise UserError(f"images must be [I, 3, H, W], got {list(images.shape)}")
 
 
 @dataclass(frozen=True)
@@ -121,35 +129,22 @@ def choose(energies: Tensor) -> Tensor:
     return energies.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf).argmin(dim=1)
 
 
-def check_starts(pairs: Pairs, starts: Tensor) -> None:
-    """`UserError` unless `starts` is `[B, N, 3]`, finite, with N >= 1."""
-    if starts.ndim != 3 or starts.shape[0] != len(pairs) or starts.shape[1] < 1 or starts.shape[2] != 3:
-        raise UserError(
-            f"starts must be [B, N, 3] with B = {len(pairs)}, got {list(starts.shape)}; for one start pass [:, None]"
-        )
+def check_starts(problems: Pairs | ViewSets, starts: Tensor) -> None:
+    """`UserError` unless `starts` is `[B, N, 3]` for pairs or `[S, V - 1, N, 3]` for sets, finite, with N >= 1."""
+    if isinstance(problems, Pairs):
+        batch, wanted = [len(problems)], f"[B, N, 3] with B = {len(problems)}"
+    else:
+        batch = [len(problems), problems.views.shape[1] - 1]
+        wanted = f"[S, V - 1, N, 3] with S = {batch[0]} and V - 1 = {batch[1]}"
+    if (
+        starts.ndim != len(batch) + 2
+        or list(starts.shape[:-2]) != batch
+        or starts.shape[-2] < 1
+        or starts.shape[-1] != 3
+    ):
+        raise UserError(f"starts must be {wanted}, got {list(starts.shape)}; for one start each pass N = 1")
     if not starts.isfinite().all():
         raise UserError("starts must be finite numbers")
-
-
-def check_view_starts(view_sets: ViewSets, starts: Tensor) -> None:
-    """`UserError` unless `starts` is `[S, V - 1, N, 3]`, finite, with N >= 1."""
-    sets, views = view_sets.views.shape
-    if starts.ndim != 4 or starts.shape[:2] != (sets, views - 1) or starts.shape[2] < 1 or starts.shape[3] != 3:
-        raise UserError(
-            f"starts must be [S, V - 1, N, 3] with S = {sets} and V - 1 = {views - 1}, got {list(starts.shape)}"
-        )
-    if not starts.isfinite().all():
-        raise UserError("starts must be finite numbers")
-
-
-def as_triple(name: str, value: float | Sequence[float]) -> list[float]:
-    """Three numbers (latitude, longitude, radius) from three, or from one that is the longitude's."""
-    triple = [0.0, float(value), 0.0] if isinstance(value, int | float) else [float(each) for each in value]
-    if len(triple) != 3 or not all(0 <= each < float("inf") for each in triple):
-        raise UserError(
-            f"{name} must be one number (longitude) or three (latitude, longitude, radius), none negative; got {value}"
-        )
-    return triple
 
 
 class Solver(ABC):
@@ -177,9 +172,9 @@ class Solver(ABC):
 
         Unless a solver reasons about all views together, each pair with the first view is solved for itself.
         """
-        check_view_starts(view_sets, starts)
+        check_starts(view_sets, starts)
         sets, views = view_sets.views.shape
-        solution = self.solve(view_sets.pairs([0] * (views - 1), range(1, views)), starts.flatten(0, 1), seed)
+        solution = self.solve(view_sets.with_first(), starts.flatten(0, 1), seed)
         chosen = solution.chosen[:, None]
         energies = solution.energies.new_full((sets, views, views), torch.nan)
         energies[:, 0, 1:] = solution.energies.gather(1, chosen).view(sets, views - 1)

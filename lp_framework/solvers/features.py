@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings, optional_import
 from lp_framework.geometry import from_opencv, inverse
 from lp_framework.keyed_random import keyed_bits
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.matchers import Learned, Matcher, Matches, Sift, require
+from lp_framework.solvers.matchers import Learned, Matcher, Matches, Sift
 from lp_framework.solvers.relative_cameras import RelativeCameraSolver
 
 MINIMAL = 5  # matches that fix an essential matrix
@@ -47,17 +47,16 @@ class Features(RelativeCameraSolver):
         reference_radius: float = 1.4,
     ) -> None:
         super().__init__(reference_radius)
-        for name, value, fits, wanted in (
+        check_settings(
+            "solver",
             ("ratio", ratio, 0 < ratio <= 1, "in (0, 1]"),
             ("tolerance_pixels", tolerance_pixels, tolerance_pixels > 0, "positive"),
             ("fewest_inliers", fewest_inliers, fewest_inliers >= MINIMAL, f"at least {MINIMAL}"),
             ("field_of_view_degrees", field_of_view_degrees, 0 < field_of_view_degrees < 180, "between 0 and 180"),
-        ):
-            if not fits:
-                raise UserError(f"solver.{name} must be {wanted}, got {value}")
+        )
         if matcher == "sift" and weights is not None:
             raise UserError(f"solver.matcher=sift has no weights, got solver.weights={weights}")
-        self.poselib = require("poselib", "solver=features", "pip install 'lp_framework[features]'")
+        self.poselib = optional_import("poselib", "solver=features", "pip install 'lp_framework[features]'")
         self.matcher: Matcher = Sift(ratio) if matcher == "sift" else Learned(matcher, weights)
         self.network = self.matcher.network  # where those look who move it to a device
         self.tolerance, self.fewest_inliers = tolerance_pixels, fewest_inliers

@@ -14,11 +14,11 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, optional_import
 from lp_framework.geometry import from_opencv, inverse, relative_camera, rigid_transform
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.matchers import require, weights_error
+from lp_framework.solvers.matchers import weights_error
 from lp_framework.solvers.relative_cameras import RelativeCameraSolver
 
 
@@ -75,7 +75,7 @@ class Dust3r(FeedForward):
         reference_radius: float = 1.4,
     ) -> None:
         parts = (
-            require(f"dust3r.{part}", "solver=dust3r", "see docs/baselines.md, it is not on the package index")
+            optional_import(f"dust3r.{part}", "solver=dust3r", "see docs/baselines.md, it is not on the package index")
             for part in ("model", "inference", "cloud_opt")
         )
         model, self.inference, self.alignment = parts
@@ -115,8 +115,8 @@ class VGGT(FeedForward):
         reference_radius: float = 1.4,
     ) -> None:
         package = "pip install git+https://github.com/facebookresearch/vggt"
-        model = require("vggt.models.vggt", "solver=vggt", package)
-        self.encoding = require("vggt.utils.pose_enc", "solver=vggt", package)
+        model = optional_import("vggt.models.vggt", "solver=vggt", package)
+        self.encoding = optional_import("vggt.utils.pose_enc", "solver=vggt", package)
         super().__init__(_loaded(partial(_load_vggt, model.VGGT), "VGGT", weights), image_size, reference_radius)
 
     def cameras(self, images: Tensor) -> Tensor:

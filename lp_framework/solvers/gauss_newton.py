@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.clock import now
-from lp_framework.errors import UserError
+from lp_framework.errors import check_settings
 from lp_framework.geometry import wrap_angle
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
@@ -62,14 +62,13 @@ class GaussNewton(Solver):
         damping: float = 1e-2,
         trajectory: bool = False,
     ) -> None:
-        if refinement_steps < 0:
-            raise UserError(f"solver.refinement_steps must not be negative, got {refinement_steps}")
-        if not timesteps or not all(0 <= each < prior.num_timesteps for each in timesteps):
-            raise UserError(
-                f"solver.timesteps must be one or more of 0 to {prior.num_timesteps - 1}, got {list(timesteps)}"
-            )
-        if not 0 < damping < math.inf:
-            raise UserError(f"solver.damping must be positive, got {damping}")
+        known = bool(timesteps) and all(0 <= each < prior.num_timesteps for each in timesteps)
+        check_settings(
+            "solver",
+            ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"),
+            ("timesteps", list(timesteps), known, f"one or more of 0 to {prior.num_timesteps - 1}"),
+            ("damping", damping, 0 < damping < math.inf, "positive"),
+        )
         self.first = Langevin(model, alpha, gamma, iterations, trajectory=trajectory)
         self.model, self.prior = model, prior
         self.steps, self.timesteps, self.damping = refinement_steps, list(timesteps), damping

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.clock import now
-from lp_framework.errors import UserError
+from lp_framework.errors import check_settings
 from lp_framework.geometry import wrap_angle
 from lp_framework.keyed_random import keyed_uniform
 from lp_framework.priors.base import Prior
@@ -24,7 +24,6 @@ from lp_framework.solvers.base import (
     ViewSets,
     ViewSolution,
     check_starts,
-    check_view_starts,
     choose,
 )
 from lp_framework.solvers.descent import GradientDescent, descend
@@ -87,7 +86,8 @@ class IDPose(Solver):
         averaged: int = 20,
         trajectory: bool = False,
     ) -> None:
-        for name, value, fits, wanted in (
+        check_settings(
+            "solver",
             ("longitudes", longitudes, longitudes >= 1, "at least 1"),
             ("latitudes_degrees", latitudes_degrees, len(latitudes_degrees) >= 1, "one angle or more"),
             ("timestep", timestep, 0 <= timestep < 1, "in [0, 1)"),
@@ -99,9 +99,7 @@ class IDPose(Solver):
             ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"),
             ("refinement_rate", refinement_rate, refinement_rate > 0, "positive"),
             ("averaged", averaged, averaged >= 1, "at least 1"),
-        ):
-            if not fits:
-                raise UserError(f"solver.{name} must be {wanted}, got {value}")
+        )
         self.prior, self.candidates, self.longitudes = prior, candidates, longitudes
         self.latitudes = [math.radians(each) for each in latitudes_degrees]
         self.timestep = int(timestep * prior.num_timesteps)
@@ -151,7 +149,7 @@ class IDPose(Solver):
 
         The energies are those of the chosen candidates before refinement.
         """
-        check_view_starts(view_sets, starts)
+        check_starts(view_sets, starts)
         began = now(starts.device)
         sets, views = view_sets.views.shape
         others = list(range(1, views))

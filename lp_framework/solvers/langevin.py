@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from lp_framework.clock import now
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import wrap_angle
 from lp_framework.keyed_random import keyed_normal
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, as_triple, check_starts, choose
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
 from lp_framework.solvers.progress import steps_of
 
 
@@ -34,12 +34,11 @@ class Langevin(Solver):
     ) -> None:
         if not 0 < alpha < 2:
             raise UserError(f"solver.alpha must lie between 0 and 2 for the update to converge, got {alpha}")
-        if iterations < 0:
-            raise UserError(f"solver.iterations must not be negative, got {iterations}")
+        check_settings("solver", ("iterations", iterations, iterations >= 0, "at least 0"))
         if choose_by == "energy" and model.outputs != 1:
             raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use score_norm")
         self.model = model
-        self.alpha, self.gamma = alpha, as_triple("solver.gamma", gamma)
+        self.alpha, self.gamma = alpha, _triple(gamma)
         self.iterations, self.choose_by, self.trajectory = iterations, choose_by, trajectory
 
     @torch.no_grad()
@@ -93,3 +92,14 @@ class Langevin(Solver):
         offset = pose[:, :, None] - pose[:, None]
         offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
         return offset.norm(dim=-1).nanmedian(dim=-1).values  # a start that failed leaves the others theirs
+
+
+def _triple(gamma: float | Sequence[float]) -> list[float]:
+    """`gamma` of latitude, longitude and radius, from three numbers or from one that is the longitude's."""
+    triple = [0.0, float(gamma), 0.0] if isinstance(gamma, int | float) else [float(each) for each in gamma]
+    if len(triple) != 3 or not all(0 <= each < math.inf for each in triple):
+        raise UserError(
+            "solver.gamma must be one number (longitude) or three (latitude, longitude, radius), "
+            f"none negative; got {gamma}"
+        )
+    return triple

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from torch import Tensor, nn
 
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, optional_import
 
 WEIGHTS = {  # hub ids of the learned matchers' published weights
     "lightglue": "ETH-CVG/lightglue_superpoint",
@@ -53,17 +51,9 @@ class Matcher(Protocol):
         """Matches on the objects of two described images."""
 
 
-def require(module: str, user: str, package: str) -> ModuleType:
-    """A module of an optional package, or a `UserError` that says what to install."""
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        raise UserError(f"{user} needs the Python package '{error.name}', which is not installed: {package}") from error
-
-
 def weights_error(network: str, source: str, error: Exception) -> UserError:
     """What to raise where the weights of a network could not be loaded."""
-    reason = str(error).strip().partition("\n")[0] or type(error).__name__
+    reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return UserError(
         f"{source}: the weights of {network} cannot be had from there ({reason}); "
         "give solver.weights= a local path or an id of the Hugging Face hub"
@@ -91,7 +81,7 @@ class Sift:
     network = None
 
     def __init__(self, ratio: float) -> None:
-        self.cv2 = require("cv2", "solver=features", "pip install 'lp_framework[features]'")
+        self.cv2 = optional_import("cv2", "solver=features", "pip install 'lp_framework[features]'")
         self.ratio = ratio
         self.sift = self.cv2.SIFT_create(enable_precise_upscale=True)  # else points are off by a quarter of a pixel
         self.nearest = self.cv2.BFMatcher(self.cv2.NORM_L2)
@@ -129,7 +119,7 @@ class Learned:
 
     def __init__(self, name: str, weights: str | None) -> None:
         user = f"solver.matcher={name}"
-        transformers = require("transformers", user, "pip install 'transformers>=4.54'")
+        transformers = optional_import("transformers", user, "pip install 'transformers>=4.54'")
         source = weights or WEIGHTS[name]
         try:
             self.processor = transformers.AutoImageProcessor.from_pretrained(source)

@@ -23,7 +23,6 @@ from lp_framework.solvers.base import (
     ViewSets,
     ViewSolution,
     check_starts,
-    check_view_starts,
     choose,
 )
 from lp_framework.solvers.descent import Adam, Plateau, descend
@@ -117,7 +116,7 @@ class MultiView(Solver):
 
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """See `Solver.solve_views`. A set is invalid when model or prior failed so that an image's pose is unknown."""
-        check_view_starts(view_sets, starts)
+        check_starts(view_sets, starts)
         began = now(starts.device)
         joint = self._solve(view_sets, starts, seed)
         chosen = choose(joint.energies.nansum(dim=(-2, -1)).masked_fill(~joint.valid, torch.nan))

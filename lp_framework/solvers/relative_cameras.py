@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.clock import now
-from lp_framework.errors import UserError
+from lp_framework.errors import check_settings
 from lp_framework.geometry import pose_of_relative_camera
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts
 
@@ -24,8 +24,7 @@ class RelativeCameraSolver(Solver):
     one_answer = True
 
     def __init__(self, reference_radius: float) -> None:
-        if not reference_radius > 0:
-            raise UserError(f"solver.reference_radius must be positive, got {reference_radius}")
+        check_settings("solver", ("reference_radius", reference_radius, reference_radius > 0, "positive"))
         self.reference_radius = reference_radius
 
     @abstractmethod

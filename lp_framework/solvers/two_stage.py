@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from lp_framework.errors import UserError
+from lp_framework.errors import check_settings
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
@@ -45,8 +45,7 @@ class TwoStage(Solver):
         rescoring: int = 16,
         trajectory: bool = False,
     ) -> None:
-        if refinement_steps < 0:
-            raise UserError(f"solver.refinement_steps must not be negative, got {refinement_steps}")
+        check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"))
         self.model, self.prior = model, prior
         self.first = Langevin(model, alpha, gamma, iterations, trajectory=trajectory)
         self.second = TwistDescent(

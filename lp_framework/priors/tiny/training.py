@@ -10,10 +10,11 @@ from torch.nn import functional
 
 from lp_framework.data.module import FeatureExtractor
 from lp_framework.data.pairs import PairBatch
+from lp_framework.errors import check_settings
 from lp_framework.keyed_random import keyed_bits, keyed_normal
 from lp_framework.models.backbones import Backbone
 from lp_framework.models.pair_mean import PairMean
-from lp_framework.models.trained_module import TrainedModule, check_settings
+from lp_framework.models.trained_module import TrainedModule
 from lp_framework.models.view_head import relative_pose_loss
 from lp_framework.priors.ddim import scaled_linear_alphas
 from lp_framework.priors.tiny.latents import shrink
@@ -66,6 +67,7 @@ class PriorModel(TrainedModule):
     ) -> None:
         super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
         check_settings(
+            "model",
             ("latent_dim", latent_dim, 1 <= latent_dim <= 3072, "from 1 to 3072"),
             ("scale", scale, scale > 0, "positive"),
             ("orders", orders, orders >= 1, "at least 1"),
