@@ -61,7 +61,7 @@ def estimate_pose(
     pairs = view_set(prepared, device).pairs([0], [1])
     starting = make_starts(starts) if isinstance(starts, str) else starts
     with shown_progress():
-        return solver.solve(pairs, starting.make(pairs.ids, seed), seed)
+        return solver.solve(pairs, starting.make(pairs, seed), seed)
 
 
 def load_model(checkpoint: str | Path | None = None) -> PoseModel:
@@ -85,7 +85,7 @@ def load_solver(name: str, model: PoseModel | None = None, prior: Prior | None =
 
 
 def make_starts(name: str, **arguments: Any) -> Starts:
-    """Starts by the name of a choice of `start=`; `.make(ids, seed)` gives `[B, N, 3]` relative poses."""
+    """Starts by the name of a choice of `start=`; `.make(pairs, seed)` gives `[B, N, 3]` relative poses."""
     starts: Starts = registry.build("start", _settings("start", name, arguments))
     return starts
 

@@ -128,7 +128,7 @@ def test_both_contenders_descend_the_same_energy(priors, images, pairs):
 
 def test_a_batched_step_encodes_nothing_and_passes_the_network_once(priors, pairs):
     batch_prior, _ = priors
-    batched = Batched(PairEnergy(batch_prior, pairs, seed=0), Ring(3).make(pairs.ids, seed=0))
+    batched = Batched(PairEnergy(batch_prior, pairs, seed=0), Ring(3).make(pairs, seed=0))
     before = batched.poses.detach().clone()
     with Passes(batch_prior) as counts:
         batched.step()
@@ -274,7 +274,7 @@ def test_launches_are_what_computes():
 
 def test_a_batched_step_has_as_many_launches_from_few_starts_as_from_many(priors, pairs):
     energy = PairEnergy(priors[0], pairs, seed=0)
-    two, four = (launched(Batched(energy, Ring(count).make(pairs.ids, seed=0)).step) for count in (2, 4))
+    two, four = (launched(Batched(energy, Ring(count).make(pairs, seed=0)).step) for count in (2, 4))
     assert two == four > 300
 
 
@@ -379,7 +379,7 @@ def test_the_first_stage_as_a_loop_ends_where_the_batch_does(pose_model):
     solver = Langevin(pose_model, gamma=0.0, iterations=5)
     pairs = all_pairs(32, 3, CPU)
     assert len(pairs) == 6 and len(pairs.images) == 3
-    starts = Ring(2).make(pairs.ids, seed=0)
+    starts = Ring(2).make(pairs, seed=0)
     batched = solver.solve(pairs, starts, seed=0).poses
     loop = first_stage.PlainLoop(solver).solve(pairs, starts)
     loop[..., 1] = wrap_angle(loop[..., 1]) % (2 * torch.pi)

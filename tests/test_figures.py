@@ -190,7 +190,7 @@ def test_predicted_cameras_stand_where_the_solver_says(data):
     assert [scene.title for scene in contents.scenes] == ["cup", "tram"] and contents.methods == ["iFusion"]
     places = [(0, 1), (0, 2), (0, 3)]  # there are no more
     shown = shown_pairs(data, ["cup"] * 3 + ["tram"] * 3, places * 2, CPU)
-    solution = figure.solvers["ifusion"].solve(shown.pairs, figure.starts.make(shown.pairs.ids, 0), 0)
+    solution = figure.solvers["ifusion"].solve(shown.pairs, figure.starts.make(shown.pairs, 0), 0)
     cameras = apply_relative_pose(shown.poses[:, :1], solution.poses.detach().double()).numpy()
     for number, scene in enumerate(contents.scenes):
         np.testing.assert_allclose(scene.predicted[0], cameras[3 * number : 3 * number + 3], atol=1e-6)

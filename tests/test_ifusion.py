@@ -157,7 +157,7 @@ def test_from_inside_its_basin_it_finds_the_minimum_and_from_outside_the_wrong_o
 def test_the_published_ring_leads_to_the_answer(choose_by):
     pairs, true = exact_pairs(8)
     prior = ExactPrior(*WRONG_VALLEY)
-    solution = IFusion(prior, choose_by=choose_by).solve(pairs, Ring().make(pairs.ids, seed=0), seed=0)
+    solution = IFusion(prior, choose_by=choose_by).solve(pairs, Ring().make(pairs, seed=0), seed=0)
     assert offsets(solution.answer()[:, None], true).abs().max() < 0.05
 
 

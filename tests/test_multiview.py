@@ -47,8 +47,7 @@ class Blind(ExactModel):
 
 def starts_of(sets: ViewSets, count: int = 2) -> Tensor:
     """Random starts `[S, V - 1, N, 3]`."""
-    others = sets.views.shape[1] - 1
-    return Random(count).make((sets.ids[:, None] * 100 + torch.arange(others)).flatten(), 0).unflatten(0, (-1, others))
+    return Random(count).make(sets.with_first(), 0).unflatten(0, (len(sets), -1))
 
 
 def distance(poses: Tensor, true: Tensor) -> Tensor:

@@ -107,7 +107,7 @@ def test_the_score_model_finds_the_pose(landscape, folder):
     solver = registry.build("solver", {"name": "langevin", "gamma": 0.0}, model=model)
     count = len(images)
     pairs = Pairs(images, torch.zeros(count - 1, dtype=torch.long), torch.arange(1, count), torch.arange(count - 1))
-    starts = lp_framework.make_starts("grid").make(pairs.ids, seed=0)
+    starts = lp_framework.make_starts("grid").make(pairs, seed=0)
     poses = views.poses.float()
     truth = relative_pose(poses[:1].expand_as(poses), poses)[1:]
     turn = (solver.solve(pairs, starts, seed=0).answer()[:, 1] - truth[:, 1] + math.pi) % (2 * math.pi) - math.pi

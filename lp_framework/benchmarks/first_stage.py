@@ -62,7 +62,7 @@ def all_pairs(side: int, views: int, device: torch.device) -> Pairs:
 
 
 def _works(solver: Langevin, pairs: Pairs, starts: int) -> tuple[Work, Work]:
-    poses = Ring(starts).make(pairs.ids, seed=0)
+    poses = Ring(starts).make(pairs, seed=0)
 
     def batched() -> float:
         solver.solve(pairs, poses, seed=0)

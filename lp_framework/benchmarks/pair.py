@@ -35,7 +35,7 @@ def measure(stage: SecondStage, model: PoseModel, starts: Sequence[int], steps: 
     batch_prior, loop_prior = stage.priors()
     solver = TwoStage(model.to(stage.device), batch_prior, refinement_steps=steps)
     pair = random_pair(stage.device)
-    ring = {count: Ring(count).make(pair.ids, seed=0).to(stage.device) for count in starts}
+    ring = {count: Ring(count).make(pair, seed=0).to(stage.device) for count in starts}
 
     def ours(count: int) -> Work:
         def work() -> float:

@@ -74,7 +74,7 @@ class Precision:
         pair = random_pair(self.device)
         plain = Zero123Prior(networks, max_batch=self.max_batch).to(self.device)
         codes = plain.encode(pair.images)
-        starts = Ring(self.starts).make(pair.ids, seed=0)
+        starts = Ring(self.starts).make(pair, seed=0)
         runner = Batched(PairEnergy(plain, pair, 0, codes), starts)
         memory = self.memory(runner, plain)
         with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
@@ -103,7 +103,7 @@ class Precision:
     ) -> Iterator[Section]:
         """A variant's section; `exact` is the gradient `[1, N, 3]` in plain float32. Its U-Net is gone afterwards."""
         plain = ours.runner.energy
-        starts = Ring(self.starts).make(plain.pairs.ids, seed=0)
+        starts = Ring(self.starts).make(plain.pairs, seed=0)
         runner = Batched(PairEnergy(prior, plain.pairs, plain.seed, plain.codes), starts)
         memory = self.memory(runner, prior)
         off = deviation(gradient(runner), exact)
@@ -152,7 +152,7 @@ class Precision:
         with meta:
             prior = Zero123Prior(Networks(ARCHITECTURES[self.architecture]))
         pair = random_pair(meta)
-        return counted(Batched(PairEnergy(prior, pair, seed=0), Ring(self.starts).make(pair.ids, seed=0)).step)
+        return counted(Batched(PairEnergy(prior, pair, seed=0), Ring(self.starts).make(pair, seed=0)).step)
 
     def work(self, runner: Batched) -> Work:
         """Some steps, worth as many."""

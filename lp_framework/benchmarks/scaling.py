@@ -81,7 +81,7 @@ class Scaling:
         """Solves so many pairs from so many starts each."""
         index = torch.arange(pairs, device=self.device)
         problem = Pairs(self.images(2 * pairs), 2 * index, 2 * index + 1, ids=index)
-        poses = Ring(starts).make(index, seed=0)
+        poses = Ring(starts).make(problem, seed=0)
 
         def work() -> float:
             solver.solve(problem, poses, seed=0)
@@ -94,7 +94,7 @@ class Scaling:
         sets = self.fixed["sets"]
         places = torch.arange(sets * (views + 1), device=self.device).view(sets, views + 1)
         problem = ViewSets(self.images(places.numel()), places, ids=places[:, 0])
-        poses = Ring(self.fixed["starts"]).make(places[:, 1:].flatten(), seed=0).unflatten(0, (sets, views))
+        poses = Ring(self.fixed["starts"]).make(problem.with_first(), seed=0).unflatten(0, (sets, views))
 
         def work() -> float:
             solver.solve_views(problem, poses, seed=0)

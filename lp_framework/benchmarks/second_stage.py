@@ -176,7 +176,7 @@ class SecondStage:
         began = now(self.device)
         energy = PairEnergy(batch_prior, pair, seed=0)
         encoding = now(self.device) - began
-        ring = {count: Ring(count).make(pair.ids, seed=0) for count in self.starts}
+        ring = {count: Ring(count).make(pair, seed=0) for count in self.starts}
         batched = {count: Batched(energy, starts) for count, starts in ring.items()}
         loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(self.starts)][0]]
         measured = {count: {BATCHED: Measured(), LOOP: Measured()} for count in self.starts}
@@ -206,7 +206,7 @@ class SecondStage:
         meta = replace(self, device=torch.device("meta"), compile=False)
         batch_prior, loop_prior = meta.priors()
         pair = random_pair(meta.device)
-        batched = Batched(PairEnergy(batch_prior, pair, seed=0), Ring(1).make(pair.ids, seed=0))
+        batched = Batched(PairEnergy(batch_prior, pair, seed=0), Ring(1).make(pair, seed=0))
         loop = PlainLoop(loop_prior, pair.images, torch.zeros(3))
         pose = torch.zeros(3, device=meta.device, requires_grad=True)
         noise = torch.empty(2, *loop_prior.latent_shape, device=meta.device)

@@ -147,7 +147,7 @@ def _adam_gauss_newton(config: DictConfig, device: torch.device) -> Iterator[Sec
     starts = Ring(settings.pop("starts"))
     pairs = adam_gauss_newton.some_pairs(views, count, device)
     note = f"{len(pairs)} pairs of {config.data.name}'s test views, {starts.count} starts, prior={config.prior.name}"
-    poses = starts.make(pairs.ids, seed=0)
+    poses = starts.make(pairs, seed=0)
     return adam_gauss_newton.measure(pairs, poses, _pose_model(), prior, **settings, device=device, note=note)
 
 

@@ -93,7 +93,7 @@ def run(config: DictConfig) -> None:
     view_sets = view_set(prepared, device)
     ids = view_sets.pairs([0] * (len(files) - 1), range(1, len(files))).ids
     with shown_progress():
-        solution = solver.solve_views(view_sets, starts.make(ids, config.seed)[None], config.seed)
+        solution = solver.solve_views(view_sets, starts.make(view_sets.with_first(), config.seed)[None], config.seed)
 
     names = [f"images/{index:03d}.png" for index in range(len(files))]
     relative = torch.cat([torch.zeros(1, 3, dtype=torch.float64), solution.poses[0].detach().cpu().double()])

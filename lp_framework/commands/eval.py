@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import RichProgressBar
 from omegaconf import DictConfig
@@ -113,8 +112,7 @@ def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
         parameters = sum(each.numel() for network in solver.networks() for each in network.parameters())
         if parameters <= LARGE:
             return EVALUATION_PAIRS
-        count = starts.make(torch.zeros(1, dtype=torch.int64), 0).shape[1]
-        return max(1, LARGE_SAMPLES // solver.samples_per_pair(count))
+        return max(1, LARGE_SAMPLES // solver.samples_per_pair(starts.count))
     if not isinstance(batch_pairs, int) or batch_pairs < 1:
         raise UserError(f"batch_pairs must be a number of pairs, or null; got {batch_pairs}")
     return batch_pairs

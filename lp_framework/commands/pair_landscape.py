@@ -94,7 +94,7 @@ def run(config: DictConfig, folder: Path) -> None:
     solver, prior = components["solver"], components["prior"].to(device)
     move(solver, device)
     model = components["model"].to(device) if shown.truth is not None else None
-    starts = components["start"].make(shown.pairs.ids, config.seed)
+    starts = components["start"].make(shown.pairs, config.seed)
     radius = torch.zeros(1) if shown.truth is None else shown.truth[2:]
     with shown_progress():
         energies = prior_landscapes(

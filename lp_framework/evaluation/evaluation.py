@@ -83,7 +83,7 @@ class Evaluation(LightningModule):
     def solve(self, batch: PairBatch) -> Solution:
         """The solver's solution of a batch's pairs."""
         pairs = pairs_of(batch, self.table, self.device)
-        return self.solver.solve(pairs, self.starts.make(pairs.ids, self.seed), self.seed)
+        return self.solver.solve(pairs, self.starts.make(pairs, self.seed), self.seed)
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:
         solution = self.solve(batch)

@@ -110,7 +110,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[Example]:
     batch = data[views]
     assert data.images is not None  # evaluation never caches features
     pairs = pairs_of(batch, table, evaluation.device)
-    starts = evaluation.starts.make(pairs.ids, evaluation.seed)
+    starts = evaluation.starts.make(pairs, evaluation.seed)
     solution = _retraced(evaluation, pairs, starts, rows["answer"][[pick.row for pick in picks]])
     truth = batch.relative_poses()
     landscapes = _landscapes(evaluation, pairs, truth[:, 2])

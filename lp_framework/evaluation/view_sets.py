@@ -8,7 +8,7 @@ from lp_framework.data.pairs import PairBatch
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.journal import Journal
 from lp_framework.keyed_random import keyed_bits
-from lp_framework.solvers.base import Solution, Solver, ViewSets
+from lp_framework.solvers.base import Solution, Solver, ViewSets, pairs_of
 from lp_framework.solvers.starts import Starts
 
 
@@ -25,10 +25,11 @@ class ViewSetEvaluation(Evaluation):
 
     def solve(self, batch: PairBatch) -> Solution:
         """The sets' solution, as one of the pairs of each first image with the others."""
-        ids = self.table.pair_ids(batch.pairs).to(self.device).view(-1, self.others)
-        views = torch.cat([batch.reference.view_as(ids)[:, :1], batch.query.view_as(ids)], dim=1)
-        view_sets = ViewSets(batch.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0])
-        starts = self.starts.make(ids.flatten(), self.seed).unflatten(0, (-1, self.others))
+        pairs = pairs_of(batch, self.table, self.device)
+        ids = pairs.ids.view(-1, self.others)
+        views = torch.cat([pairs.reference.view_as(ids)[:, :1], pairs.query.view_as(ids)], dim=1)
+        view_sets = ViewSets(pairs.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0])
+        starts = self.starts.make(pairs, self.seed).unflatten(0, (-1, self.others))
         solution = self.solver.solve_views(view_sets, starts, self.seed)
         poses = solution.poses.flatten(0, 1)[:, None]
         return Solution(

@@ -69,7 +69,7 @@ class CamerasFigure(PaperFigure[CameraContents]):
         targets = max(1, min(self.targets, fewest - 1))
         objects = [name for name in self.objects for _ in range(targets)]
         shown = shown_pairs(self.data, objects, [(0, k + 1) for k in range(targets)] * len(self.objects), device)
-        starts = self.starts.make(shown.pairs.ids, seed)
+        starts = self.starts.make(shown.pairs, seed)
         reference, query = (shown.poses[:, side, None] for side in (0, 1))
         predicted, near = [], []
         for name in self.methods:

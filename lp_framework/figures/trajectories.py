@@ -76,7 +76,7 @@ class TrajectoriesFigure(PaperFigure[TrajectoryContents]):
         """The pair is solved once, from all starts together."""
         shown = shown_pairs(self.data, [self.object], [self.places], device)
         latitude, longitude = landscape_grid()
-        starts = Ring().make(shown.pairs.ids, seed)
+        starts = Ring().make(shown.pairs, seed)
         with shown_progress():
             solution = self.solver.solve(shown.pairs, starts, seed)
             assert solution.trajectory is not None

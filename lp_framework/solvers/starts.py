@@ -9,19 +9,25 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import keyed_uniform
 from lp_framework.registry import register
+from lp_framework.solvers.base import Pairs
 
 _STARTS = 0x5747  # separates the draws of starts from a solver's own under the same seed
 
 
 class Starts(ABC):
-    """Makes N starts a pair."""
+    """Makes `count` starts a pair. A constructor may declare a `model` or a `prior`, as a solver's may."""
+
+    count: int
 
     @abstractmethod
-    def make(self, ids: Tensor, seed: int) -> Tensor:
-        """Starts `[B, N, 3]` (radians, radians, scene units; radius relative) for pairs with ids `[B]`, float32."""
+    def make(self, pairs: Pairs, seed: int) -> Tensor:
+        """Starts `[B, count, 3]` (radians, radians, scene units; radius relative), float32, on the pairs' device.
+
+        Those of a pair depend on its images, its id and `seed` alone.
+        """
 
 
 @register("start", "ring")
@@ -29,14 +35,13 @@ class Ring(Starts):
     """`count` longitudes evenly around the object, at one latitude (radians); iFusion's are 0, 90, 180, 270 degrees."""
 
     def __init__(self, count: int = 4, latitude: float = 0.0) -> None:
-        if count < 1:
-            raise UserError(f"start.count must be at least 1, got {count}")
+        check_settings("start", ("count", count, count >= 1, "at least 1"))
         self.count, self.latitude = count, latitude
 
-    def make(self, ids: Tensor, seed: int) -> Tensor:
-        longitude = torch.arange(self.count, device=ids.device) * (2 * math.pi / self.count)
+    def make(self, pairs: Pairs, seed: int) -> Tensor:
+        longitude = torch.arange(self.count, device=pairs.ids.device) * (2 * math.pi / self.count)
         poses = torch.stack([torch.full_like(longitude, self.latitude), longitude, torch.zeros_like(longitude)], dim=-1)
-        return poses.expand(len(ids), -1, -1)
+        return poses.expand(len(pairs), -1, -1)
 
 
 @register("start", "grid")
@@ -50,11 +55,11 @@ class Grid(Starts):
     ) -> None:
         if not latitudes_degrees or not longitudes_degrees:
             raise UserError("start.latitudes_degrees and start.longitudes_degrees need at least one angle each")
-        self.latitudes, self.longitudes = list(latitudes_degrees), list(longitudes_degrees)
+        self.poses = [(math.radians(a), math.radians(b), 0.0) for a in latitudes_degrees for b in longitudes_degrees]
+        self.count = len(self.poses)
 
-    def make(self, ids: Tensor, seed: int) -> Tensor:
-        poses = [(math.radians(a), math.radians(b), 0.0) for a in self.latitudes for b in self.longitudes]
-        return torch.tensor(poses, device=ids.device).expand(len(ids), -1, -1)
+    def make(self, pairs: Pairs, seed: int) -> Tensor:
+        return torch.tensor(self.poses, device=pairs.ids.device).expand(len(pairs), -1, -1)
 
 
 @register("start", "random")
@@ -62,14 +67,15 @@ class Random(Starts):
     """`count` starts drawn uniformly: latitude within `latitude` (radians) of 0, any longitude, relative radius 0."""
 
     def __init__(self, count: int = 4, latitude: float = math.pi / 6) -> None:
-        if count < 1:
-            raise UserError(f"start.count must be at least 1, got {count}")
-        if not 0 <= latitude < math.pi / 2:
-            raise UserError(f"start.latitude must lie in [0, pi/2), got {latitude}")
+        check_settings(
+            "start",
+            ("count", count, count >= 1, "at least 1"),
+            ("latitude", latitude, 0 <= latitude < math.pi / 2, "in [0, pi/2)"),
+        )
         self.count, self.latitude = count, latitude
 
-    def make(self, ids: Tensor, seed: int) -> Tensor:
-        number = torch.arange(self.count, device=ids.device)
-        uniform = keyed_uniform(seed, _STARTS, ids[:, None], number, count=2)
+    def make(self, pairs: Pairs, seed: int) -> Tensor:
+        number = torch.arange(self.count, device=pairs.ids.device)
+        uniform = keyed_uniform(seed, _STARTS, pairs.ids[:, None], number, count=2)
         latitude, longitude = (2 * uniform[..., 0] - 1) * self.latitude, uniform[..., 1] * 2 * math.pi
         return torch.stack([latitude, longitude, torch.zeros_like(latitude)], dim=-1).float()

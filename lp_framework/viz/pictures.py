@@ -103,7 +103,7 @@ def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, ND
     A solver with a model has two maps, its field and the exact one; any other has one, without arrows.
     """
     pairs = pairs_of(batch, evaluation.table, evaluation.device)
-    starts = evaluation.starts.make(pairs.ids, evaluation.seed)
+    starts = evaluation.starts.make(pairs, evaluation.seed)
     truth = batch.relative_poses()[0]
     solver = recording(evaluation.solver)
     solution = solver.solve(pairs, starts, evaluation.seed)
