@@ -48,7 +48,7 @@ def test_a_batch_is_pytorchs_optimizer_and_schedule_on_each_start_alone(kind, ra
                 schedule.step(total)
                 path.append(single.detach().clone())
             rates.append(reference.param_groups[0]["lr"])
-            torch.testing.assert_close(found.path[b, n], torch.stack(path), rtol=0, atol=1e-6)
+            torch.testing.assert_close(found.trajectory[b, n], torch.stack(path), rtol=0, atol=1e-6)
             assert found.total[b, n].item() == pytest.approx(total, abs=1e-6)
     torch.testing.assert_close(optimizer.rate.flatten(), torch.tensor(rates, dtype=torch.float64))
     drops = (torch.tensor(rates) / rate).log() / torch.tensor(0.6).log()
@@ -83,9 +83,9 @@ def test_the_plateau_is_pytorchs_on_any_values(patience):
 def test_the_path_runs_from_the_start_to_the_end(steps):
     begin = parameters()
     found = descend(energy, same, begin, steps, GradientDescent(begin, 0.05))
-    assert found.path.shape == (BATCH, STARTS, steps + 1, 4)
-    assert torch.equal(found.path[:, :, 0], begin)
-    met = sum((energy(found.path[:, :, step], step) for step in range(steps)), torch.zeros(BATCH, STARTS))
+    assert found.trajectory.shape == (BATCH, STARTS, steps + 1, 4)
+    assert torch.equal(found.trajectory[:, :, 0], begin)
+    met = sum((energy(found.trajectory[:, :, step], step) for step in range(steps)), torch.zeros(BATCH, STARTS))
     torch.testing.assert_close(found.total, met.double())
 
 
@@ -120,12 +120,12 @@ def test_a_start_that_fails_stops_where_it_was_sound_and_leaves_the_others_alone
     others = torch.ones(BATCH, STARTS, dtype=torch.bool)
     others[1, 1] = False
     assert torch.equal(found.valid, others)
-    assert torch.equal(found.path[others], healthy.path[others])
+    assert torch.equal(found.trajectory[others], healthy.trajectory[others])
     assert torch.equal(found.total[others], healthy.total[others])
     last = max(0, since - 1)  # the last pose whose energy was finite
-    assert torch.equal(found.path[1, 1, :since], healthy.path[1, 1, :since])
-    assert (found.path[1, 1, last:] == healthy.path[1, 1, last]).all()
-    assert found.path.isfinite().all()
+    assert torch.equal(found.trajectory[1, 1, :since], healthy.trajectory[1, 1, :since])
+    assert (found.trajectory[1, 1, last:] == healthy.trajectory[1, 1, last]).all()
+    assert found.trajectory.isfinite().all()
 
 
 def test_a_pose_that_is_not_finite_after_the_last_step_is_not_kept():
@@ -137,7 +137,7 @@ def test_a_pose_that_is_not_finite_after_the_last_step_is_not_kept():
 
     found = descend(lambda poses, _: 0.5 * poses.square().sum(dim=-1), breaks, begin, 1, GradientDescent(begin, 0.25))
     assert found.valid.tolist() == [[True, False]]
-    assert found.path[0, :, -1, 0].tolist() == [0.375, 1.5]
+    assert found.trajectory[0, :, -1, 0].tolist() == [0.375, 1.5]
 
 
 def test_longitudes_go_on_over_the_turn():

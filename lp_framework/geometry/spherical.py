@@ -34,6 +34,16 @@ def _reduce(angle: Tensor, turn: float) -> Tensor:
     return torch.where(rest >= turn, rest - turn, rest)
 
 
+def reduce_longitude(pose: Tensor) -> Tensor:
+    """The same pose `[..., 3]` with its longitude in [0, 2 pi).
+
+    >>> reduce_longitude(torch.tensor([0.1, -0.5, 1.5]))
+    tensor([0.1000, 5.7832, 1.5000])
+    """
+    latitude, longitude, radius = pose.unbind(-1)
+    return torch.stack([latitude, wrap_angle(longitude) % (2 * math.pi), radius], dim=-1)
+
+
 def relative_pose(reference: Tensor, query: Tensor) -> Tensor:
     """Relative pose `[..., 3]`, query minus reference, of two view poses `[..., 3]`; longitude in [0, 2 pi).
 

@@ -70,10 +70,10 @@ class Plateau:
 
 
 class Descended(NamedTuple):
-    """`path` `[B, N, steps + 1, P]` from the starts to the ends; `total` `[B, N]`, the sum of the energies met;
+    """`trajectory` `[B, N, steps + 1, P]` from the starts to the ends; `total` `[B, N]`, the sum of the energies met;
     `valid` `[B, N]`."""
 
-    path: Tensor
+    trajectory: Tensor
     total: Tensor
     valid: Tensor
 
@@ -95,7 +95,7 @@ def descend(
     valid = torch.ones_like(optimizer.rate, dtype=torch.bool)
     total = torch.zeros_like(optimizer.rate)
     sound, place = parameters, pose_of(parameters)  # the last of each start where energy and gradient were finite
-    path = []
+    trajectory = []
     for step in steps_of(steps, "descending the prior"):
         variable = parameters.detach().clone().requires_grad_()
         with torch.enable_grad():
@@ -105,19 +105,20 @@ def descend(
         valid = valid & energies.isfinite() & gradient.isfinite().all(dim=-1)
         alive = valid[..., None]
         sound, place = torch.where(alive, parameters, sound), torch.where(alive, pose.detach(), place)
-        path.append(place)
+        trajectory.append(place)
         parameters = torch.where(alive, parameters + optimizer.step(gradient.masked_fill(~alive, 0.0)), sound)
         total = total + energies.detach().masked_fill(~valid, 0.0)
         if plateau is not None:
             plateau.step(total)
     pose = pose_of(parameters)
     finite = pose.isfinite().all(dim=-1)
-    path.append(torch.where(finite[..., None], pose, place))
-    return Descended(torch.stack(path, dim=2), total, valid & finite)
+    trajectory.append(torch.where(finite[..., None], pose, place))
+    return Descended(torch.stack(trajectory, dim=2), total, valid & finite)
 
 
-def unwrapped(path: Tensor) -> Tensor:
-    """A path `[B, N, steps + 1, 3]` of poses whose longitudes go on from step to step, by less than half a turn."""
-    turns = wrap_angle(path[..., 1].diff(dim=-1)).cumsum(dim=-1)
-    longitude = torch.cat([path[..., :1, 1], path[..., :1, 1] + turns], dim=-1)
-    return torch.stack([path[..., 0], longitude, path[..., 2]], dim=-1)
+def unwrapped(trajectory: Tensor) -> Tensor:
+    """The trajectory `[B, N, steps + 1, 3]` with longitudes that go on from step to step, by less than half a turn."""
+    latitude, longitude, radius = trajectory.unbind(-1)
+    turns = wrap_angle(longitude.diff(dim=-1)).cumsum(dim=-1)
+    longitude = torch.cat([longitude[..., :1], longitude[..., :1] + turns], dim=-1)
+    return torch.stack([latitude, longitude, radius], dim=-1)

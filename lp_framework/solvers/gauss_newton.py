@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lp_framework.clock import now
 from lp_framework.errors import check_settings
-from lp_framework.geometry import wrap_angle
+from lp_framework.geometry import reduce_longitude
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
@@ -19,8 +19,8 @@ from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_start
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
-from lp_framework.solvers.stages import in_a_row
 from lp_framework.solvers.twist import TanhRadius
+from lp_framework.solvers.two_stage import in_a_row
 
 LONGEST_STEP = 0.5  # radians and scene units; the prior is not to be left where it hardly depends on the pose
 
@@ -88,7 +88,7 @@ class GaussNewton(Solver):
         energy = PairEnergy(self.prior, pairs, seed)
         noise = energy.noise(0, len(self.timesteps))
         pose = _plausible(starts.clone())
-        path = [pose]
+        trajectory = [pose]
         here = self._quadratic(energy, pose, noise)
         damping = self.damping * here.hessian.diagonal(dim1=-2, dim2=-1).amax(dim=-1)  # [B, N]
         growth = torch.full_like(damping, 2.0)
@@ -112,18 +112,16 @@ class GaussNewton(Solver):
                 torch.where(better[..., None], there.gradient, here.gradient),
                 torch.where(better[..., None, None], there.hessian, here.hessian),
             )
-            path.append(pose)
+            trajectory.append(pose)
         valid = here.energy.isfinite() & here.gradient.isfinite().all(dim=-1)
         energies = here.energy.masked_fill(~valid, torch.nan)
-        reduced = pose.clone()
-        reduced[..., 1] = wrap_angle(pose[..., 1]) % (2 * math.pi)
         return Solution(
-            poses=reduced,
+            poses=reduce_longitude(pose),
             energies=energies,
             valid=valid,
             chosen=choose(energies),
             cost=Cost(energy.passes, now(starts.device) - began),
-            trajectory=torch.stack(path, dim=2) if self.trajectory else None,
+            trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
         )
 
     def _quadratic(self, energy: PairEnergy, pose: Tensor, noise: Tensor) -> Quadratic:

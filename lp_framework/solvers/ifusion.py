@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from lp_framework.errors import UserError
+from lp_framework.errors import check_settings
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.twist import ChooseBy, SineRadius, TwistDescent
+from lp_framework.solvers.twist import ChooseBy, DescentSettings, SineRadius, TwistDescent
 
 
 @register("solver", "ifusion")
@@ -37,19 +37,8 @@ class IFusion(TwistDescent):
         fresh_noise: bool = True,
         trajectory: bool = False,
     ) -> None:
-        if steps < 1:
-            raise UserError(f"solver.steps must be at least 1, got {steps}")
-        super().__init__(
-            prior,
-            SineRadius(),
-            steps,
-            learning_rate,
-            factor,
-            patience,
-            first_timestep,
-            last_timestep,
-            choose_by,
-            rescoring,
-            fresh_noise,
-            trajectory,
+        check_settings("solver", ("steps", steps, steps >= 1, "at least 1"))
+        settings = DescentSettings(
+            steps, learning_rate, factor, patience, first_timestep, last_timestep, choose_by, rescoring, fresh_noise
         )
+        super().__init__(prior, SineRadius(), settings, trajectory)

@@ -1,48 +1,58 @@
-"""The paper's Joint Reasoning across Multiple Views: one consistent set of poses for two and more images."""
+"""The paper's Joint Reasoning across Multiple Views: one consistent set of poses for two and more images.
+
+1. `measure`: the first stage (Eq. 4) on all ordered pairs.
+2. `fit`: the absolute poses that most of its ends agree on (see `pose_graph`).
+3. `refine`: all poses together descend the sum of the prior's energies over the ordered pairs (Eq. 5).
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import combinations, permutations
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lp_framework.clock import now
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
+from lp_framework.geometry import relative_pose
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import (
-    Cost,
-    Pairs,
-    Solution,
-    Solver,
-    ViewSets,
-    ViewSolution,
-    check_starts,
-    choose,
-)
-from lp_framework.solvers.descent import Adam, Plateau, descend
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, check_starts, choose
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
-from lp_framework.solvers.twist import TanhRadius, TwistDescent, TwistPoses
+from lp_framework.solvers.twist import DescentSettings, TanhRadius, TwistPoses
 
 NEAREST = 0.1  # distance to the truth (radians, scene units) below which the norm of a score does not tell it
 
 
+class Measured(NamedTuple):
+    """N measurements of each ordered pair of S sets (row: reference, column: query): relative `poses`
+    `[S, V, V, N, 3]`, their `weights` `[S, V, V, N]` (0: none), and the `passes` they took."""
+
+    poses: Tensor
+    weights: Tensor
+    passes: int
+
+
 class Joint(NamedTuple):
     """N answers to each of S sets: `poses` `[S, N, V - 1, 3]` relative to the first image, `energies`
-    `[S, N, V, V]` of the ordered pairs (row: reference), `valid` `[S, N]`, and the passes they took.
-    """
+    `[S, N, V, V]` of the ordered pairs (NaN: not looked at), `valid` `[S, N]`, and the `passes` they took."""
 
     poses: Tensor
     energies: Tensor
     valid: Tensor
     passes: int
+
+    @classmethod
+    def at(cls, poses: Tensor, valid: Tensor, passes: int) -> Joint:
+        """Poses whose energies are not known."""
+        sets, count, others, _ = poses.shape
+        return cls(poses, poses.new_full((sets, count, others + 1, others + 1), torch.nan), valid, passes)
 
 
 @register("solver", "multiview")
@@ -78,26 +88,14 @@ class MultiView(Solver):
     ) -> None:
         if not (first_stage or second_stage):
             raise UserError("solver.first_stage and solver.second_stage cannot both be false; nothing would be left")
-        if refinement_steps < 1:
-            raise UserError(f"solver.refinement_steps must be at least 1, got {refinement_steps}")
+        check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 1, "at least 1"))
         self.model, self.prior = model, prior
         self.first_stage, self.second_stage = first_stage, second_stage
         self.first = Langevin(model, alpha, gamma, iterations)
-        # Of the second stage of `two_stage` this is the schedule.
-        self.second = TwistDescent(
-            prior,
-            TanhRadius(),
-            refinement_steps,
-            learning_rate,
-            factor,
-            patience,
-            first_timestep,
-            last_timestep,
-            "rescored",
-            rescoring,
-            fresh_noise=True,
-            trajectory=False,
+        self.second = DescentSettings(
+            refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, "rescored", rescoring
         )
+        self.second.check(prior)
 
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`: each pair as a set of two images; one pose a pair, or one a start without first stage."""
@@ -132,82 +130,74 @@ class MultiView(Solver):
     @torch.no_grad()
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
         """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
-        sets, others, count, _ = starts.shape
-        initial = Joint(
-            starts.transpose(1, 2).clone(),
-            starts.new_full((sets, count, others + 1, others + 1), torch.nan),
-            torch.ones(sets, count, dtype=torch.bool, device=starts.device),
-            0,
-        )
         if self.first_stage:
-            initial = self._fitted(view_sets, starts, seed)
-        return self._refined(view_sets, initial, seed) if self.second_stage else initial
+            joint = self.fit(self.measure(view_sets, starts, seed))
+        else:
+            valid = torch.ones(len(view_sets), starts.shape[2], dtype=torch.bool, device=starts.device)
+            joint = Joint.at(starts.transpose(1, 2).clone(), valid, passes=0)
+        return self.refine(view_sets, joint, seed) if self.second_stage else joint
 
-    def _fitted(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
-        """The first stage on all ordered pairs and the fit of their ends."""
+    def measure(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Measured:
+        """1. The first stage's ends on all ordered pairs, each from the starts of its query relative to its reference.
+
+        A pair with the first image as query starts from the opposite of its reference's starts.
+        """
         sets, views = view_sets.views.shape
         reference, query = torch.tensor(list(permutations(range(views), 2))).T.tolist()
-        back = torch.stack([-starts[..., 0], -starts[..., 1] % (2 * math.pi), -starts[..., 2]], dim=-1)
-        pair_starts = [starts[:, j - 1] if j > 0 else back[:, i - 1] for i, j in zip(reference, query, strict=True)]
+        back = relative_pose(starts, torch.zeros_like(starts))
+        from_starts = [starts[:, j - 1] if j > 0 else back[:, i - 1] for i, j in zip(reference, query, strict=True)]
         pairs = view_sets.pairs(reference, query)
-        solution = self.first.solve(pairs, torch.stack(pair_starts, dim=1).flatten(0, 1), seed)
-        measured = starts.new_full((sets, views, views, starts.shape[2], 3), torch.nan)
-        measured[:, reference, query] = solution.poses.unflatten(0, (sets, -1))
-        weights = torch.zeros_like(measured[..., 0])
+        solution = self.first.solve(pairs, torch.stack(from_starts, dim=1).flatten(0, 1), seed)
+        poses = starts.new_full((sets, views, views, starts.shape[2], 3), torch.nan)
+        poses[:, reference, query] = solution.poses.unflatten(0, (sets, -1))
+        weights = torch.zeros_like(poses[..., 0])
         weights[:, reference, query] = 1 / (solution.energies.unflatten(0, (sets, -1)).square() + NEAREST**2)
-        weights = weights.masked_fill(~weights.isfinite(), 0.0)
-        known = (weights > 0).any(dim=-1)
-        return Joint(
-            poses=fit_views(measured, weights)[:, None, 1:].to(starts.dtype),
-            energies=starts.new_full((sets, 1, views, views), torch.nan),
-            valid=(known | known.mT).any(dim=-1).all(dim=-1, keepdim=True),
-            passes=solution.cost.network_passes,
-        )
+        return Measured(poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes)
 
-    def _refined(self, view_sets: ViewSets, initial: Joint, seed: int) -> Joint:
-        """The second stage from N sets of poses at once."""
-        sets, count, others, _ = initial.poses.shape
+    def fit(self, measured: Measured) -> Joint:
+        """2. One answer a set; it is valid where every image has been measured with some other."""
+        poses = fit_views(measured.poses, measured.weights)[:, None, 1:].to(measured.poses.dtype)
+        known = (measured.weights > 0).any(dim=-1)
+        return Joint.at(poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True), measured.passes)
+
+    def refine(self, view_sets: ViewSets, initial: Joint, seed: int) -> Joint:
+        """3. Joint descent (Eq. 5) from N sets of poses at once, by a twist for each image but the first."""
+        settings = self.second
+        sets, _, others, _ = initial.poses.shape
         ends = list(zip(*combinations(range(others + 1), 2), strict=True))
         energy = PairEnergy(self.prior, view_sets.pairs(*ends), seed)  # both directions of an unordered pair
         first, second = torch.tensor(ends, device=initial.poses.device)
-        twist = initial.poses.new_zeros(sets, count, others * 6)
-        to_poses = TwistPoses(initial.poses, self.second.radius_map)
+        to_poses = TwistPoses(initial.poses, TanhRadius())
 
         def pose_of(twist: Tensor) -> Tensor:
+            """Poses `[S, N, (V - 1) x 3]` of twists `[S, N, (V - 1) x 6]`."""
             return to_poses(twist.unflatten(-1, (others, 6))).flatten(-2)
 
         def relative(poses: Tensor) -> Tensor:
             """Relative poses `[S x pairs, N, 3]` of poses `[S, N, (V - 1) x 3]`."""
-            poses = poses.unflatten(-1, (others, 3))
-            poses = torch.cat([torch.zeros_like(poses[:, :, :1]), poses], dim=2)
+            poses = pad(poses.unflatten(-1, (others, 3)), (0, 0, 1, 0))  # the first image's is 0
             return (poses[:, :, second] - poses[:, :, first]).transpose(1, 2).flatten(0, 1)
 
         def of_step(poses: Tensor, step: int) -> Tensor:
             """The sum over ordered pairs, `[S, N]`."""
-            timestep = self.second.timestep(step / self.second.steps)
-            return 2 * energy(relative(poses), timestep, energy.noise(step)[:, 0]).unflatten(0, (sets, -1)).sum(dim=1)
+            energies = energy(relative(poses), settings.timestep(step / settings.steps), energy.noise(step)[:, 0])
+            return 2 * energies.unflatten(0, (sets, -1)).sum(dim=1)
 
-        adam = Adam(twist, self.second.learning_rate)
-        plateau = Plateau(adam, self.second.factor, self.second.patience)
-        path, _, valid = descend(of_step, pose_of, twist, self.second.steps, adam, plateau)
-        poses, rescoring = path[:, :, -1], self.second.rescoring
-        noise = energy.noise(self.second.steps, rescoring)
+        twist = initial.poses.new_zeros(*initial.poses.shape[:2], others * 6)
+        trajectory, _, valid = settings.descend(of_step, pose_of, twist)
+        ends_of_all, noise = trajectory[:, :, -1], energy.noise(settings.steps, settings.rescoring)
         directed = torch.stack(
             [
-                energy.residual(relative(poses), self.second.timestep((number + 0.5) / rescoring), noise[:, number])
-                .square()
-                .mean(dim=-1)
-                for number in range(rescoring)
+                energy.residual(relative(ends_of_all), timestep, noise[:, number]).square().mean(dim=-1)
+                for number, timestep in enumerate(settings.rescoring_timesteps())
             ]
-        ).mean(dim=0)  # [S x pairs, N, 2]
+        ).mean(dim=0)
+        directed = directed.unflatten(0, (sets, -1)).transpose(1, 2)  # [S, N, pairs, 2]
         energies = torch.full_like(initial.energies, torch.nan)
-        energies[:, :, first, second], energies[:, :, second, first] = (
-            directed.unflatten(0, (sets, -1)).transpose(1, 2).unbind(dim=-1)
-        )
-        finite = directed.isfinite().all(dim=-1).unflatten(0, (sets, -1)).all(dim=1)
+        energies[:, :, first, second], energies[:, :, second, first] = directed.unbind(dim=-1)
         return Joint(
-            poses=poses.unflatten(-1, (others, 3)),
+            poses=ends_of_all.unflatten(-1, (others, 3)),
             energies=energies,
-            valid=initial.valid & valid & finite,
+            valid=initial.valid & valid & directed.isfinite().all(dim=-1).all(dim=-1),
             passes=initial.passes + energy.passes,
         )

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from lp_framework.clock import now
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import camera_to_world, se3_exp, view_pose
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
-from lp_framework.solvers.descent import Adam, Plateau, descend, unwrapped
+from lp_framework.solvers.descent import Adam, Descended, Plateau, descend, unwrapped
 from lp_framework.solvers.pair_energy import PairEnergy
 
 ChooseBy = Literal["accumulated", "rescored"]
@@ -92,49 +94,61 @@ class TwistPoses:
         return torch.stack([latitude + self.rest, longitude, self.radius_map.radius(norm)], dim=-1)
 
 
-class TwistDescent(Solver):
-    """iFusion's descent of the prior's energy from every start: twists by Adam, the timestep falling with the step."""
+@dataclass(frozen=True)
+class DescentSettings:
+    """How Adam descends a prior's energy; the solvers' settings of the same names, see `ifusion`."""
 
-    def __init__(
-        self,
-        prior: Prior,
-        radius_map: RadiusMap,
-        steps: int,
-        learning_rate: float,
-        factor: float,
-        patience: int,
-        first_timestep: int,
-        last_timestep: int,
-        choose_by: ChooseBy,
-        rescoring: int,
-        fresh_noise: bool,
-        trajectory: bool,
-    ) -> None:
-        for name, value, fits, wanted in (
-            ("learning_rate", learning_rate, learning_rate > 0, "positive"),
-            ("factor", factor, 0 < factor <= 1, "above 0 and at most 1"),
-            ("patience", patience, patience >= 0, "at least 0"),
-            ("rescoring", rescoring, rescoring >= 1, "at least 1"),
-            ("last_timestep", last_timestep, 0 <= last_timestep <= first_timestep, "from 0 to first_timestep"),
+    steps: int
+    learning_rate: float
+    factor: float
+    patience: int
+    first_timestep: int
+    last_timestep: int
+    choose_by: ChooseBy
+    rescoring: int
+    fresh_noise: bool = True
+
+    def check(self, prior: Prior) -> None:
+        """`UserError` that names a setting which is out of range; timesteps are those of `prior`."""
+        first, last = self.first_timestep, self.last_timestep
+        check_settings(
+            "solver",
+            ("learning_rate", self.learning_rate, self.learning_rate > 0, "positive"),
+            ("factor", self.factor, 0 < self.factor <= 1, "above 0 and at most 1"),
+            ("patience", self.patience, self.patience >= 0, "at least 0"),
+            ("rescoring", self.rescoring, self.rescoring >= 1, "at least 1"),
+            ("last_timestep", last, 0 <= last <= first, "from 0 to first_timestep"),
             (
                 "first_timestep",
-                first_timestep,
-                first_timestep < prior.num_timesteps,
+                first,
+                first < prior.num_timesteps,
                 f"below the prior's {prior.num_timesteps} timesteps",
             ),
-        ):
-            if not fits:
-                raise UserError(f"solver.{name} must be {wanted}, got {value}")
-        self.prior, self.radius_map = prior, radius_map
-        self.steps, self.learning_rate, self.factor, self.patience = steps, learning_rate, factor, patience
-        self.first_timestep, self.last_timestep = first_timestep, last_timestep
-        self.choose_by, self.rescoring = choose_by, rescoring
-        self.fresh_noise, self.trajectory = fresh_noise, trajectory
+        )
 
     def timestep(self, done: float) -> int:
         """The timestep when a share `done` in [0, 1) of the way from the first to the last is behind."""
         span = self.first_timestep + 1 - self.last_timestep
         return min(round(self.last_timestep + (1 - done) * span), self.first_timestep)
+
+    def rescoring_timesteps(self) -> list[int]:
+        """Those on which final poses are compared, spread over the whole way."""
+        return [self.timestep((number + 0.5) / self.rescoring) for number in range(self.rescoring)]
+
+    def descend(
+        self, energy: Callable[[Tensor, int], Tensor], pose_of: Callable[[Tensor], Tensor], twist: Tensor
+    ) -> Descended:
+        """`descent.descend` by Adam and the plateau schedule, from twists `[B, N, D]`."""
+        adam = Adam(twist, self.learning_rate)
+        return descend(energy, pose_of, twist, self.steps, adam, Plateau(adam, self.factor, self.patience))
+
+
+class TwistDescent(Solver):
+    """iFusion's descent of the prior's energy from every start: twists by Adam, the timestep falling with the step."""
+
+    def __init__(self, prior: Prior, radius_map: RadiusMap, settings: DescentSettings, trajectory: bool) -> None:
+        settings.check(prior)
+        self.prior, self.radius_map, self.settings, self.trajectory = prior, radius_map, settings, trajectory
 
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -142,33 +156,25 @@ class TwistDescent(Solver):
         """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
         check_starts(pairs, starts)
         began = now(starts.device)
-        energy = PairEnergy(self.prior, pairs, seed)
-        twist = starts.new_zeros(*starts.shape[:2], 6)
-        adam = Adam(twist, self.learning_rate)
+        settings, energy = self.settings, PairEnergy(self.prior, pairs, seed)
 
         def of_step(poses: Tensor, step: int) -> Tensor:
-            noise = energy.noise(step if self.fresh_noise else 0)[:, 0]
-            return energy(poses, self.timestep(step / self.steps), noise)
+            noise = energy.noise(step if settings.fresh_noise else 0)[:, 0]
+            return energy(poses, settings.timestep(step / settings.steps), noise)
 
-        path, energies, valid = descend(
-            of_step,
-            TwistPoses(starts.clone(), self.radius_map),
-            twist,
-            self.steps,
-            adam,
-            Plateau(adam, self.factor, self.patience),
-        )
-        poses = path[:, :, -1]
-        if self.choose_by == "rescored":
-            timesteps = [self.timestep((number + 0.5) / self.rescoring) for number in range(self.rescoring)]
-            energies = energy.mean(poses, timesteps, energy.noise(self.steps, self.rescoring))
+        to_poses = TwistPoses(starts.clone(), self.radius_map)
+        trajectory, energies, valid = settings.descend(of_step, to_poses, starts.new_zeros(*starts.shape[:2], 6))
+        ends = trajectory[:, :, -1]
+        if settings.choose_by == "rescored":
+            noise = energy.noise(settings.steps, settings.rescoring)
+            energies = energy.mean(ends, settings.rescoring_timesteps(), noise)
             valid = valid & energies.isfinite()
         energies = energies.masked_fill(~valid, torch.nan)
         return Solution(
-            poses=poses,
+            poses=ends,
             energies=energies,
             valid=valid,
             chosen=choose(energies),
             cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
-            trajectory=unwrapped(path) if self.trajectory else None,
+            trajectory=unwrapped(trajectory) if self.trajectory else None,
         )

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 
+import torch
 from torch import Tensor
 
 from lp_framework.errors import check_settings
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import Pairs, Solution, Solver
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose
 from lp_framework.solvers.langevin import Langevin
-from lp_framework.solvers.stages import in_a_row
-from lp_framework.solvers.twist import ChooseBy, TanhRadius, TwistDescent
+from lp_framework.solvers.twist import ChooseBy, DescentSettings, TanhRadius, TwistDescent
 
 
 @register("solver", "two_stage")
@@ -48,24 +49,42 @@ class TwoStage(Solver):
         check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"))
         self.model, self.prior = model, prior
         self.first = Langevin(model, alpha, gamma, iterations, trajectory=trajectory)
-        self.second = TwistDescent(
-            prior,
-            TanhRadius(),
-            refinement_steps,
-            learning_rate,
-            factor,
-            patience,
-            first_timestep,
-            last_timestep,
-            choose_by,
-            rescoring,
-            fresh_noise=True,
-            trajectory=trajectory,
+        settings = DescentSettings(
+            refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, choose_by, rescoring
         )
+        self.second = TwistDescent(prior, TanhRadius(), settings, trajectory)
 
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start is invalid when the model or the prior failed on its way."""
         first = self.first.solve(pairs, starts, seed)
-        if self.second.steps == 0:
+        if self.second.settings.steps == 0:
             return first
         return in_a_row(first, lambda ends: self.second.solve(pairs, ends, seed))
+
+
+def in_a_row(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
+    """The solution of `second`, which is given the ends of `first` `[B, N, 3]`, with trajectory and cost of both.
+
+    Energies and choice are the second's. A start is invalid where either failed; where the first did, it stays there.
+    """
+    # A start that failed goes along at the origin, so that the others stay in their places.
+    after = second(first.poses.masked_fill(~first.valid[..., None], 0.0))
+    energies = after.energies.masked_fill(~first.valid, torch.nan)
+    return Solution(
+        poses=torch.where(first.valid[..., None], after.poses, first.poses),
+        energies=energies,
+        valid=first.valid & after.valid,
+        chosen=choose(energies),
+        cost=Cost(first.cost.network_passes + after.cost.network_passes, first.cost.seconds + after.cost.seconds),
+        trajectory=_joined(first.trajectory, after.trajectory),
+    )
+
+
+def _joined(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    """Both trajectories, the second's longitudes in the turn where the first ended; the hand-over counts once."""
+    if first is None or second is None:
+        return None
+    after = second[:, :, 1:]
+    turns = ((first[:, :, -1:, 1] - second[:, :, :1, 1]) / (2 * math.pi)).round()
+    after = torch.stack([after[..., 0], after[..., 1] + 2 * math.pi * turns, after[..., 2]], dim=-1)
+    return torch.cat([first, after], dim=2)  # where the first stage failed the turns are NaN
