@@ -1,31 +1,30 @@
-"""ID-Pose (Cheng et al. 2023): candidates are probed, the best descend a little, the very best far."""
+"""ID-Pose (Cheng et al. 2023): candidates are probed, the best descend a little, the very best far.
+
+1. `explore`: a grid of candidates for each image is probed, the better half descends, is probed again, some are kept.
+2. `select`: of each image the candidate of least energy; among several images by triangles of them.
+3. `refine`: the selected poses descend together, one image at a time.
+
+Published code: `estimate_poses` and `find_optimal_poses` of github.com/xt4d/id-pose.
+"""
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot, pad
 
 from lp_framework.clock import now
 from lp_framework.errors import check_settings
-from lp_framework.geometry import wrap_angle
+from lp_framework.geometry import reduce_longitude
 from lp_framework.keyed_random import keyed_uniform
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import (
-    Cost,
-    Pairs,
-    Solution,
-    Solver,
-    ViewSets,
-    ViewSolution,
-    check_starts,
-    choose,
-)
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, check_starts, choose
 from lp_framework.solvers.descent import GradientDescent, descend
 from lp_framework.solvers.pair_energy import PairEnergy, keyed_noise
 
@@ -34,19 +33,19 @@ _REFINEMENT = 0x4944  # separates the draws of the refinement from those of the 
 
 class Candidates(NamedTuple):
     """The K best of B pairs, best first: `poses` `[B, K, 3]`, their probed `energies` `[B, K]` (NaN where the prior
-    failed), `path` `[B, K, steps, 3]` on which they came there."""
+    failed), the `trajectory` `[B, K, steps, 3]` on which they came there."""
 
     poses: Tensor
     energies: Tensor
-    path: Tensor
+    trajectory: Tensor
 
 
 class Refined(NamedTuple):
-    """The answers `[S, V - 1, 3]` of S sets, `valid` `[S]`, and the `path` `[S, steps + 1, V - 1, 3]`."""
+    """The answers `[S, V - 1, 3]` of S sets, `valid` `[S]`, and the `trajectory` `[S, steps + 1, V - 1, 3]`."""
 
     poses: Tensor
     valid: Tensor
-    path: Tensor
+    trajectory: Tensor
 
 
 @register("solver", "id_pose")
@@ -120,26 +119,26 @@ class IDPose(Solver):
         check_starts(pairs, starts)
         began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
-        found = self._explore(energy, starts)
+        found = self.explore(energy, starts)
         chosen = choose(found.energies)
         row = torch.arange(len(pairs), device=chosen.device)
         views = torch.stack([pairs.reference, pairs.query], dim=1)
-        refined = self._refine(energy, views, pairs.ids, found.poses[row, chosen][:, None])
-        poses, valid = found.poses.clone(), found.energies.isfinite()
-        poses[row, chosen] = refined.poses[:, 0]
+        refined = self.refine(energy, views, pairs.ids, found.poses[row, chosen][:, None])
+        ends, valid = found.poses.clone(), found.energies.isfinite()
+        ends[row, chosen] = refined.poses[:, 0]
         valid[row, chosen] &= refined.valid
-        path = None
+        trajectory = None
         if self.trajectory:
-            rest = found.path[:, :, -1:].expand(-1, -1, refined.path.shape[1] - 1, -1).clone()
-            rest[row, chosen] = refined.path[:, 1:, 0]
-            path = torch.cat([found.path, rest], dim=2)
+            rest = found.trajectory[:, :, -1:].repeat(1, 1, refined.trajectory.shape[1] - 1, 1)
+            rest[row, chosen] = refined.trajectory[:, 1:, 0]
+            trajectory = torch.cat([found.trajectory, rest], dim=2)
         return Solution(
-            poses=_reduced(poses),
+            poses=reduce_longitude(ends),
             energies=found.energies,
             valid=valid,
             chosen=chosen,
             cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
-            trajectory=path,
+            trajectory=trajectory,
         )
 
     @torch.inference_mode(False)
@@ -152,60 +151,58 @@ class IDPose(Solver):
         check_starts(view_sets, starts)
         began = now(starts.device)
         sets, views = view_sets.views.shape
-        others = list(range(1, views))
-        energy = PairEnergy(self.prior, view_sets.pairs([0] * len(others), others), seed)
-        found = self._explore(energy, starts.flatten(0, 1))
+        energy = PairEnergy(self.prior, view_sets.with_first(), seed)
+        found = self.explore(energy, starts.flatten(0, 1))
         poses, alone = (each.unflatten(0, (sets, views - 1)) for each in found[:2])  # [S, V - 1, K, 3], [S, V - 1, K]
-        duos = list(itertools.combinations(range(views - 1), 2))
-        between = self._between(energy, view_sets, poses, duos)
+        duos = list(combinations(range(views - 1), 2))
+        between = self.energies_between(energy, view_sets, poses, duos)
         chosen = triangular_choice(alone, between, duos)
-        start = torch.take_along_dim(poses, chosen[..., None, None], dim=2).squeeze(2)
-        refined = self._refine(energy, view_sets.views, view_sets.ids, start)
+        selected = torch.take_along_dim(poses, chosen[..., None, None], dim=2).squeeze(2)
+        refined = self.refine(energy, view_sets.views, view_sets.ids, selected)
         energies = alone.new_full((sets, views, views), torch.nan)
         energies[:, 0, 1:] = alone.gather(2, chosen[..., None]).squeeze(-1)
         row = torch.arange(sets, device=chosen.device)
         for number, (i, j) in enumerate(duos):
             energies[:, i + 1, j + 1] = between[row, number, chosen[:, i], chosen[:, j]]
-        energies = torch.where(energies.isnan(), energies.mT, energies)  # both directions are in each
         return ViewSolution(
-            poses=_reduced(refined.poses),
-            energies=energies,
+            poses=reduce_longitude(refined.poses),
+            energies=torch.where(energies.isnan(), energies.mT, energies),  # both directions are in each
             valid=refined.valid & energies[:, 0, 1:].isfinite().all(dim=1),
             cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
         )
 
-    # ------------------------------------------------------------ exploration
+    # ------------------------------------------------------------ 1. exploration
 
-    def _explore(self, energy: PairEnergy, starts: Tensor) -> Candidates:
+    def explore(self, energy: PairEnergy, starts: Tensor) -> Candidates:
         """The best candidates of every pair: probed, the better half led a little downhill, probed again."""
-        poses = self._grid(starts) if self.candidates == "grid" else starts.clone()
+        poses = self.grid(starts) if self.candidates == "grid" else starts.clone()
         noise = energy.noise(self.exploration_steps, len(self.probe_timesteps))
-        first = energy.mean(poses, self.probe_timesteps, noise)
-        poses = _take(poses, _order(first)[:, : max(1, poses.shape[1] // 2)])
+        probed = energy.mean(poses, self.probe_timesteps, noise)
+        poses = _take(poses, _order(probed)[:, : max(1, poses.shape[1] // 2)])
 
         def one_direction(poses: Tensor, step: int) -> Tensor:
-            ends = (energy.pairs.query, energy.pairs.reference)
-            forward = step % 2 == 0
-            target, source = ends if forward else ends[::-1]
-            return self._one_way(
-                energy, target, source, poses if forward else -poses, energy.noise(step)[:, 0, step % 2]
-            )
+            pairs, noise = energy.pairs, energy.noise(step)[:, 0, step % 2]
+            if step % 2 == 0:
+                return self._one_way(energy, pairs.query, pairs.reference, poses, noise)
+            return self._one_way(energy, pairs.reference, pairs.query, -poses, noise)
 
-        steps = self.exploration_steps
-        path, _, valid = descend(one_direction, _same, poses, steps, GradientDescent(poses, self.exploration_rate))
-        path = path[:, :, : max(1, steps)]  # as published, the last of the poses before an update is what counts
-        last = energy.mean(path[:, :, -1], self.probe_timesteps, noise).masked_fill(~valid, torch.nan)
-        best = _order(last)[:, : self.kept]
-        path = _take(path, best)
-        return Candidates(path[:, :, -1], last.gather(1, best), path)
+        steps, rate = self.exploration_steps, GradientDescent(poses, self.exploration_rate)
+        trajectory, _, valid = descend(one_direction, _same, poses, steps, rate)
+        trajectory = trajectory[:, :, : max(1, steps)]  # as published, what counts is the last pose before an update
+        probed = energy.mean(trajectory[:, :, -1], self.probe_timesteps, noise).masked_fill(~valid, torch.nan)
+        best = _order(probed)[:, : self.kept]
+        trajectory = _take(trajectory, best)
+        return Candidates(trajectory[:, :, -1], probed.gather(1, best), trajectory)
 
-    def _grid(self, starts: Tensor) -> Tensor:
+    def grid(self, starts: Tensor) -> Tensor:
         """Candidates `[B, longitudes x latitudes, 3]` at relative radius 0."""
         longitudes = [2 * math.pi * number / self.longitudes for number in range(self.longitudes)]
         poses = [(latitude, longitude, 0.0) for longitude in longitudes for latitude in self.latitudes]
         return starts.new_tensor(poses).repeat(len(starts), 1, 1)
 
-    def _between(
+    # ------------------------------------------------------------ 2. selection
+
+    def energies_between(
         self, energy: PairEnergy, view_sets: ViewSets, poses: Tensor, duos: Sequence[tuple[int, int]]
     ) -> Tensor:
         """Probed energies `[S, P, K, K]` of the relative poses that candidates `[S, V - 1, K, 3]` of P duos imply.
@@ -224,33 +221,30 @@ class IDPose(Solver):
         energy.passes += probe.passes
         return energies.view(sets, len(duos), count, count)
 
-    # ------------------------------------------------------------ refinement
+    # ------------------------------------------------------------ 3. refinement
 
-    def _refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, start: Tensor) -> Refined:
+    def refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, selected: Tensor) -> Refined:
         """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step."""
-        others = start.shape[1]
-        duos = list(itertools.combinations(range(others + 1), 2))
-        cycle = [pair for duo in duos for pair in (duo, duo[::-1])]  # (source, target)
+        others = selected.shape[1]
+        cycle = [pair for duo in combinations(range(others + 1), 2) for pair in (duo, duo[::-1])]  # (source, target)
         moved = self._moved(cycle, ids, energy.seed, others)  # [steps, S, V]
 
         def one_pair(flat: Tensor, step: int) -> Tensor:
             source, target = cycle[step % len(cycle)]
-            poses = torch.nn.functional.pad(flat.unflatten(2, (others, 3)), (0, 0, 1, 0))[
-                :, 0
-            ]  # [S, V, 3], 0 the first
+            poses = pad(flat.unflatten(2, (others, 3)), (0, 0, 1, 0))[:, 0]  # [S, V, 3], the first image's is 0
             poses = torch.where(moved[step][..., None], poses, poses.detach())
             noise = keyed_noise(self.prior, energy.seed, _REFINEMENT, ids, step)
             relative = (poses[:, target] - poses[:, source])[:, None]
             return self._one_way(energy, views[:, target], views[:, source], relative, noise)
 
-        steps, flat = len(moved), start.flatten(1)[:, None]
-        path, _, valid = descend(one_pair, _same, flat, steps, GradientDescent(flat, self.refinement_rate))
-        path = path[:, 0].unflatten(2, (others, 3))  # [S, steps + 1, V - 1, 3]
+        steps, flat = len(moved), selected.flatten(1)[:, None]
+        trajectory, _, valid = descend(one_pair, _same, flat, steps, GradientDescent(flat, self.refinement_rate))
+        trajectory = trajectory[:, 0].unflatten(2, (others, 3))  # [S, steps + 1, V - 1, 3]
         before = moved[..., 1:].transpose(0, 1)  # [S, steps, V - 1]
         late = before & (before.flip(1).cumsum(1).flip(1) <= self.averaged)
         count = late.sum(dim=1)[..., None]
-        mean = path[:, :-1].masked_fill(~late[..., None], 0.0).sum(dim=1) / count
-        return Refined(torch.where(count > 0, mean, start), valid[:, 0], path)
+        mean = trajectory[:, :-1].masked_fill(~late[..., None], 0.0).sum(dim=1) / count
+        return Refined(torch.where(count > 0, mean, selected), valid[:, 0], trajectory)
 
     def _moved(self, cycle: Sequence[tuple[int, int]], ids: Tensor, seed: int, others: int) -> Tensor:
         """Which image a step moves, `[steps, S, V]`: of its pair the one that is not the first, of two others a random
@@ -260,7 +254,7 @@ class IDPose(Solver):
         coin = keyed_uniform(seed, _REFINEMENT, ids, number, count=1)[..., 0] < 0.5
         of_two = torch.where(coin, source, target)
         moved = torch.where(torch.minimum(source, target) > 0, of_two, torch.maximum(source, target))
-        return torch.nn.functional.one_hot(moved, others + 1).bool()
+        return one_hot(moved, others + 1).bool()
 
     def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
         """Denoising errors `[B, N]` of images `target` from `source` (`[B]` each) under poses `[B, N, 3]`.
@@ -310,9 +304,3 @@ def _order(energies: Tensor) -> Tensor:
 def _take(values: Tensor, index: Tensor) -> Tensor:
     """Of `[B, N, ...]` those at `[B, K]`."""
     return values[torch.arange(len(values), device=values.device)[:, None], index]
-
-
-def _reduced(poses: Tensor) -> Tensor:
-    """The same poses `[..., 3]` with longitudes in [0, 2 pi)."""
-    latitude, longitude, radius = poses.unbind(-1)
-    return torch.stack([latitude, wrap_angle(longitude) % (2 * math.pi), radius], dim=-1)
