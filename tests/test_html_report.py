@@ -148,7 +148,7 @@ def replace(folder: Path, old: str, new: str) -> None:
 class Tells(torch.nn.Module):
     """A score model that reads the pose off the image as `ExactPrior` does."""
 
-    outputs = 3
+    has_energy = False
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
         return images.flatten(1)[:, :3]

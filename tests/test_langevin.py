@@ -20,7 +20,7 @@ ALPHA = 0.1
 class Exact:
     """s(x) = truth - x: the score of the line's kernel at sigma 1. The first three numbers of an image are its pose."""
 
-    outputs = 3
+    has_energy = False
 
     def encode(self, images: Tensor) -> Tensor:
         return images.flatten(1)[:, :3]
@@ -33,7 +33,7 @@ class Exact:
 
 
 class ExactEnergy(Exact):
-    outputs = 1
+    has_energy = True
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue(condition - pose, 0.5 * (condition - pose).square().sum(-1))

@@ -15,8 +15,7 @@ from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world
 from lp_framework.models.backbones import Backbone, EfficientNetLite0, ResNet, Standardise, freeze
-from lp_framework.models.embedding import PoseEmbedding
-from lp_framework.models.networks import PoseNetwork
+from lp_framework.models.networks import PoseEmbedding, PoseNetwork
 from lp_framework.models.pose_model import EnergyModel, ScoreModel
 
 pytestmark = pytest.mark.filterwarnings("ignore:You are trying to `self.log")  # steps are called without a trainer

@@ -84,7 +84,7 @@ def test_grid_fills_the_map_at_one_radius():
 @pytest.mark.parametrize("sigma", [0.5, 1.0])
 @pytest.mark.parametrize("target", ["line", "periodic"])
 def test_exact_field_on_the_grid_is_the_closed_form(target: str, sigma: float):
-    model = ExactModel(PoseKernel(target, sigma), TRUTH, outputs=1)
+    model = ExactModel(PoseKernel(target, sigma), TRUTH, has_energy=True)
     condition = model.condition(*model.encode(torch.zeros(2, 3, 8, 8))[:, None])
     grid = field_on_grid(lambda pose: model.field(condition, pose), radius=0.4, spacing=12.0)
     latitude, longitude = np.meshgrid(np.deg2rad(grid.latitude), np.deg2rad(grid.longitude), indexing="ij")

@@ -203,10 +203,11 @@ def drawn(config: DictConfig, shown: Shown, landscape: Landscape, descent: Desce
 def fields_drawn(shown: Shown, model: PoseModel, starts: Tensor, seed: int) -> Figure:
     """The learned field beside the exact one, with the ways of the first stage without noise over both."""
     assert shown.truth is not None
-    field = "score" if model.outputs == 3 else "exp(-E) and score"
+    field = "exp(-E) and score" if model.has_energy else "score"
     maps: list[FieldMap] = []
     for title, guide in (
-        (f"Learned {field}", model), (f"Exact {field} (oracle)", ExactModel(model.kernel, shown.truth, model.outputs)),
+        (f"Learned {field}", model),
+        (f"Exact {field} (oracle)", ExactModel(model.kernel, shown.truth, model.has_energy)),
     ):  # fmt: skip
         solver = Langevin(guide, gamma=0.0, trajectory=True)  # type: ignore[arg-type]  # an ExactModel has all it asks
         solution = solver.solve(shown.pairs, starts, seed)

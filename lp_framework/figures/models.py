@@ -10,7 +10,7 @@ from lp_framework.models.pose_model import PoseModel
 def score_model(path: str | None) -> PoseModel:
     """The score model of a training run or checkpoint; None: the one that ships."""
     model = load_model(SHIPPED / "score" if path is None else path)
-    if model.outputs != 3:
+    if model.has_energy:
         raise UserError(f"figure.score={path}: holds an energy model, a score model is wanted")
     return model
 
@@ -23,6 +23,6 @@ def energy_model(path: str | None) -> PoseModel:
             "model=energy hydra.run.dir=runs/energy`, then add figure.energy=runs/energy"
         )
     model = load_model(path)
-    if model.outputs != 1:
+    if not model.has_energy:
         raise UserError(f"figure.energy={path}: holds a score model, an energy model is wanted")
     return model

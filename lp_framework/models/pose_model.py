@@ -34,12 +34,16 @@ class FieldValue(NamedTuple):
 
 
 class PoseModel(TrainedModule):
-    """Training and use shared by both models; a subclass says what its network's output means.
+    """A score or energy of the relative pose, given two images; a subclass says what its network's output means.
 
-    For use: `encode` images once, `condition` the network on pairs of them, then ask for the `field` at any poses.
+    Solvers ask three things of it: `encode` images once, `condition` on pairs of them, then the `field` at any poses.
+    Of *codes* they ask only that an index tensor picks from them as from a batch, `codes[pairs.reference]`; of a
+    *condition* that it can be indexed along the pairs and given further dimensions there, `condition[:, None]`, so that
+    it broadcasts against poses `[B, N, 3]`. Here both are tensors; they may be any object that does so.
     """
 
-    outputs: int
+    has_energy: bool  # whether `field` gives an energy beside the score
+    outputs: int  # of the network
 
     def __init__(
         self,
@@ -81,16 +85,16 @@ class PoseModel(TrainedModule):
     # ------------------------------------------------------------ use
 
     def encode(self, images: Tensor) -> Tensor:
-        """Features `[I, D]` of images `[I, 3, H, W]` in [-1, 1]."""
+        """Codes `[I, D]` of images `[I, 3, H, W]` in [-1, 1]."""
         return self.backbone(images)
 
     def condition(self, reference: Tensor, query: Tensor) -> Tensor:
-        """What the network needs of P pairs, `[P, hidden]`, from features `[P, D]` of either side."""
+        """The condition `[P, hidden]` of P pairs, from codes `[P, D]` of either side."""
         return self.network.project(reference, query)
 
     @abstractmethod
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
-        """Score (and energy) at relative poses `[..., 3]` for pairs `[..., hidden]`."""
+        """Score (and energy) at relative poses `[..., 3]` for conditions `[..., hidden]`, at the model's `sigma`."""
 
     # ------------------------------------------------------------ training
 
@@ -138,7 +142,7 @@ class PoseModel(TrainedModule):
 class ScoreModel(PoseModel):
     """Score network trained by denoising score matching (paper, Eq. 3)."""
 
-    outputs = 3
+    has_energy, outputs = False, 3
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue(self.network(condition, pose), None)
@@ -153,7 +157,7 @@ class ScoreModel(PoseModel):
 class EnergyModel(PoseModel):
     """Energy network trained on its closed-form target (paper, appendix "Energy-based Modeling")."""
 
-    outputs = 1
+    has_energy, outputs = True, 1
 
     def energy(self, condition: Tensor, pose: Tensor) -> Tensor:
         """-log p(pose | pair) up to a constant, `[...]`."""

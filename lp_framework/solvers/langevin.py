@@ -11,9 +11,9 @@ from torch import Tensor
 
 from lp_framework.clock import now
 from lp_framework.errors import UserError, check_settings
-from lp_framework.geometry import wrap_angle
+from lp_framework.geometry import reduce_longitude, wrap_angle
 from lp_framework.keyed_random import keyed_normal
-from lp_framework.models.pose_model import PoseModel
+from lp_framework.models.pose_model import FieldValue, PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
 from lp_framework.solvers.progress import steps_of
@@ -35,7 +35,7 @@ class Langevin(Solver):
         if not 0 < alpha < 2:
             raise UserError(f"solver.alpha must lie between 0 and 2 for the update to converge, got {alpha}")
         check_settings("solver", ("iterations", iterations, iterations >= 0, "at least 0"))
-        if choose_by == "energy" and model.outputs != 1:
+        if choose_by == "energy" and not model.has_energy:
             raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use score_norm")
         self.model = model
         self.alpha, self.gamma = alpha, _triple(gamma)
@@ -46,30 +46,26 @@ class Langevin(Solver):
         """See `Solver.solve`. A start is invalid when its pose is not finite."""
         check_starts(pairs, starts)
         began = now(starts.device)
-        features = self.model.encode(pairs.images)
-        condition = self.model.condition(features[pairs.reference], features[pairs.query])[:, None]  # [B, 1, hidden]
-        pose, path = starts, [starts]
+        codes = self.model.encode(pairs.images)
+        condition = self.model.condition(codes[pairs.reference], codes[pairs.query])[:, None]  # [B, 1, ...]
         noise = self._noise(pairs, starts.shape[1], seed).to(starts)
+        pose, trajectory = starts, [starts]
         for step in steps_of(self.iterations, "first stage"):
             pose = pose + self.alpha * self.model.field(condition, pose).score + noise[:, :, step]
-            if self.trajectory:
-                path.append(pose)
-        final = self.model.field(condition, pose)
-        energies = self._energies(pose, final.score, final.energy)
+            trajectory.append(pose)
+        energies = self._energies(pose, self.model.field(condition, pose))
         passes = len(pairs.images) + starts.shape[0] * starts.shape[1] * (self.iterations + 1)
-        reduced = pose.clone()
-        reduced[..., 1] = wrap_angle(pose[..., 1]) % (2 * math.pi)
         return Solution(
-            poses=reduced,
+            poses=reduce_longitude(pose),
             energies=energies,
             valid=pose.isfinite().all(dim=-1),
             chosen=choose(energies),
             cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
-            trajectory=torch.stack(path, dim=2) if self.trajectory else None,
+            trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
         )
 
     def _noise(self, pairs: Pairs, starts: int, seed: int) -> Tensor:
-        """G z_t for every start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""
+        """The noise gamma z_t of every start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""
         if not any(self.gamma):
             return torch.zeros(len(pairs), starts, self.iterations, 3, device=pairs.ids.device)
         number = torch.arange(starts, device=pairs.ids.device)
@@ -77,7 +73,7 @@ class Langevin(Solver):
         gamma = torch.tensor(self.gamma, dtype=draws.dtype, device=draws.device)
         return draws.view(len(pairs), starts, self.iterations, 3) * gamma
 
-    def _energies(self, pose: Tensor, score: Tensor, energy: Tensor | None) -> Tensor:
+    def _energies(self, pose: Tensor, field: FieldValue) -> Tensor:
         """By what the answer is chosen, `[B, N]`.
 
         `score_norm`: the distance that the model itself still sees, |s| = |x - x_gt| / sigma^2 for an exact score: with
@@ -85,10 +81,10 @@ class Langevin(Solver):
         `energy`: the energy model's.
         """
         if self.choose_by == "energy":
-            assert energy is not None  # of the constructor's check
-            return energy
+            assert field.energy is not None  # of the constructor's check
+            return field.energy
         if self.choose_by == "score_norm":
-            return score.norm(dim=-1)
+            return field.score.norm(dim=-1)
         offset = pose[:, :, None] - pose[:, None]
         offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
         return offset.norm(dim=-1).nanmedian(dim=-1).values  # a start that failed leaves the others theirs

@@ -28,9 +28,9 @@ from lp_framework.viz.training import LOSSES, read_curves, training_figure
 class ExactModel(nn.Module):
     """Stands in for a model in a solver: the kernel's own score around the truth `[3]`, the best there is to learn."""
 
-    def __init__(self, kernel: PoseKernel, truth: Tensor, outputs: int = 3) -> None:
+    def __init__(self, kernel: PoseKernel, truth: Tensor, has_energy: bool = False) -> None:
         super().__init__()
-        self.kernel, self.truth, self.outputs = kernel, truth, outputs
+        self.kernel, self.truth, self.has_energy = kernel, truth, has_energy
 
     def encode(self, images: Tensor) -> Tensor:
         """No features are needed: `[I, 1]`."""
@@ -43,7 +43,7 @@ class ExactModel(nn.Module):
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         """See `PoseModel`."""
         truth = self.truth.to(pose)
-        energy = self.kernel.energy(pose, truth) if self.outputs == 1 else None
+        energy = self.kernel.energy(pose, truth) if self.has_energy else None
         return FieldValue(self.kernel.score(pose, truth), energy)
 
 
@@ -109,10 +109,10 @@ def pair_contents(evaluation: Evaluation, batch: PairBatch) -> tuple[NDArray, ND
     solution = solver.solve(pairs, starts, evaluation.seed)
     model = getattr(solver, "model", None)
     if isinstance(model, PoseModel):
-        field = "score" if model.outputs == 3 else "exp(-E) and score"
+        field = "exp(-E) and score" if model.has_energy else "score"
         maps = [with_field(way("", solution, starts), f"Learned {field}", model, pairs, truth)]
         oracle = FieldMap("")
-        exact = ExactModel(model.kernel, truth, model.outputs)
+        exact = ExactModel(model.kernel, truth, model.has_energy)
         if isinstance(solver, Langevin):
             ideal = copy.copy(solver)
             ideal.model = exact  # type: ignore[assignment]  # has all of a PoseModel that this solver asks for
