@@ -91,7 +91,6 @@ def run(config: DictConfig) -> None:
     solver, starts = components["solver"], components["start"]
     move(solver, device)
     view_sets = view_set(prepared, device)
-    ids = view_sets.pairs([0] * (len(files) - 1), range(1, len(files))).ids
     with shown_progress():
         solution = solver.solve_views(view_sets, starts.make(view_sets.with_first(), config.seed)[None], config.seed)
 
