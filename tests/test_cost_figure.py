@@ -3,9 +3,9 @@
 import pytest
 from result_folders import metrics, write_result
 
-from lp_framework.evaluation.runs import find_runs
-from lp_framework.evaluation.sweep_tables import sweep_tables
-from lp_framework.viz.sweep_pictures import cost_figure
+from lp_framework.report.runs import find_runs
+from lp_framework.report.sweep_figures import cost_figure
+from lp_framework.report.sweep_tables import sweep_tables
 
 
 def table_of(folder):

@@ -34,10 +34,10 @@ from lp_framework.data.sets.object_labels import read_labels
 from lp_framework.data.sets.object_lists import ObjectLists, kept_lists
 from lp_framework.data.sets.omni3d import RADIUS, omni3d_cameras
 from lp_framework.data.views import read_views
-from lp_framework.evaluation.idpose_results import read_idpose_results
 from lp_framework.evaluation.journal import Journal
 from lp_framework.evaluation.metrics import SolvedBatch
-from lp_framework.evaluation.runs import find_runs
+from lp_framework.report.idpose_results import read_idpose_results
+from lp_framework.report.runs import find_runs
 
 FUZZ = settings(
     max_examples=100,

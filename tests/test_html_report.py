@@ -35,12 +35,12 @@ from lp_framework.evaluation.examples import (
 )
 from lp_framework.geometry import camera_to_world, wrap_angle
 from lp_framework.models.pose_model import FieldValue
+from lp_framework.report.runs import run_folders, run_kind
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 from lp_framework.viz import style
 from lp_framework.viz.html import run_page, viewer
 from lp_framework.viz.html.run_page import write_report_page, write_run_page
-from lp_framework.viz.html.runs import run_folders, run_kind
 
 LARGEST = 10_000_000  # bytes
 VOID = {"meta", "link", "img", "input", "br"}

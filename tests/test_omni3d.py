@@ -13,9 +13,9 @@ from lp_framework import registry
 from lp_framework.data.sets.omni3d import Omni3DData, omni3d_cameras, omni3d_objects
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
-from lp_framework.evaluation import idpose_results
-from lp_framework.evaluation.idpose_results import evaluate_idpose, read_idpose_results
 from lp_framework.geometry import camera_to_world, relative_pose, view_pose
+from lp_framework.report import idpose_results
+from lp_framework.report.idpose_results import evaluate_idpose, read_idpose_results
 
 PUBLISHED = Path(__file__).parent / "data" / "idpose.json"  # cameras and results of ID-Pose's published example
 POSES = {"011": (0.25, 1.0, 4.0), "001": (0.1, 3.0, 4.0), "077": (-0.2, 5.5, 4.2)}

@@ -78,7 +78,7 @@ def test_a_plugin_installed_as_a_package_is_chosen_on_the_command_line(installed
 
 def test_the_wheel_has_the_weights_and_the_papers_numbers(installed, tmp_path):
     code = (
-        "import lp_framework; from lp_framework.evaluation.paper import paper_tables; "
+        "import lp_framework; from lp_framework.report.paper import paper_tables; "
         "print(lp_framework.load_prior('tiny').latent_shape, len(paper_tables()))"
     )
     assert run(installed / "python", "-c", code, cwd=tmp_path).stdout == "(192, 1, 1) 9\n"

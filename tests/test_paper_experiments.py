@@ -11,7 +11,7 @@ from co3d_layout import write_category
 from scanned_layouts import write_gso, write_oo3d
 from tiny_runs import Commands, Ran
 
-from lp_framework.evaluation.paper import paper_table
+from lp_framework.report.paper import paper_table
 
 SMALL = ("data.resolution=24", "data.image_size=24")
 RENDERED = (

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lp_framework.evaluation.paper import paper_table, paper_tables
-from lp_framework.evaluation.report_tables import METRICS
+from lp_framework.report.paper import paper_table, paper_tables
+from lp_framework.report.printed_tables import METRICS
 
 TABLES = Path(__file__).parent / "data" / "paper_tables.txt"
 

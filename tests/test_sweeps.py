@@ -14,7 +14,7 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from tiny_runs import Commands, Ran
 
-from lp_framework.evaluation.paper import paper_tables
+from lp_framework.report.paper import paper_tables
 
 ROOT = Path(__file__).parents[1]
 SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2")

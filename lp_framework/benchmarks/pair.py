@@ -16,8 +16,8 @@ from lp_framework.benchmarks.second_stage import (
     random_pair,
 )
 from lp_framework.benchmarks.section import Section
-from lp_framework.evaluation.paper import paper_table
 from lp_framework.models.pose_model import PoseModel
+from lp_framework.report.paper import paper_table
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 

@@ -12,8 +12,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from lp_framework.errors import UserError
-from lp_framework.evaluation.journal import FOLDER, MOVABLE, compared_settings, unfinished
-from lp_framework.evaluation.runs import RESULT, differences
+from lp_framework.evaluation.journal import FOLDER, MOVABLE, compared_settings, differences, unfinished
+from lp_framework.evaluation.tables import RESULT
 
 
 def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | None) -> bool:

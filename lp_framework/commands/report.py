@@ -12,15 +12,14 @@ from rich.text import Text
 
 from lp_framework.commands.building import plain, run_folder, versions
 from lp_framework.errors import UserError, nearest
-from lp_framework.evaluation.report_tables import as_json, csv_rows, heading, markdown, shown, terminal
-from lp_framework.evaluation.runs import LeftOut, find_runs
-from lp_framework.evaluation.sweep_tables import Objects, SweepTable, sweep_tables
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
+from lp_framework.report.printed_tables import as_json, csv_rows, heading, markdown, shown, terminal
+from lp_framework.report.runs import LeftOut, find_runs, run_folders
+from lp_framework.report.sweep_figures import cost_figure, sweep_figure
+from lp_framework.report.sweep_tables import Objects, SweepTable, sweep_tables
 from lp_framework.viz.html.run_page import PAGE, write_report_page
-from lp_framework.viz.html.runs import run_folders
 from lp_framework.viz.html.sweep_part import left_out_part, sweep_part
 from lp_framework.viz.style import save_figure
-from lp_framework.viz.sweep_pictures import cost_figure, sweep_figure
 
 PLACE = ("data.name", "protocol", "checkpoint", "prior.name", "solver.name", "start.name", "views")  # of all runs
 

@@ -22,8 +22,7 @@ import torch
 
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import SolvedBatch
-from lp_framework.evaluation.runs import RESULT, differences, dotted
-from lp_framework.evaluation.tables import write_text
+from lp_framework.evaluation.tables import RESULT, write_text
 
 log = logging.getLogger(__name__)
 
@@ -127,6 +126,31 @@ def compared_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     left_out = {"plugins", "resume", "checkpoint", *MOVABLE}
     return {key: value for key, value in dotted(config).items() if key not in left_out}
+
+
+def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config's values by their dotted keys; a list is one value.
+
+    >>> dotted({"seed": 1, "start": {"name": "ring", "count": 4}})
+    {'seed': 1, 'start.name': 'ring', 'start.count': 4}
+    """
+    found: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            found |= {f"{key}.{name}": each for name, each in dotted(value).items()}
+        else:
+            found[str(key)] = value
+    return found
+
+
+def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The keys whose values differ, with both values; a key that is missing on a side counts as None there.
+
+    >>> differences({"gamma": 0, "steps": 5}, {"gamma": 0.3, "steps": 5})
+    {'gamma': (0, 0.3)}
+    """
+    keys = sorted({*ours, *theirs})
+    return {key: (ours.get(key), theirs.get(key)) for key in keys if ours.get(key) != theirs.get(key)}
 
 
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:

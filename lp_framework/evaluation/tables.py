@@ -19,6 +19,7 @@ from lp_framework.atomic import written
 from lp_framework.data.pairs import ViewTable
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, PoseMetrics
 
+RESULT = "results.json"  # of a finished evaluation
 COLUMNS = [f"{prefix}@{degrees}" for prefix in ("R", "R(R)", "SR", "SR(R)") for degrees in ROTATION_THRESHOLDS]
 ERRORS = ["rotation_error", "translation_error"]
 
@@ -104,7 +105,7 @@ def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, 
         [[name.strip(), *(round(row[key], 5) if key in row else "" for key in keys)] for name, row in rows],
     )
     write_csv(folder / "pairs.csv", PAIR_COLUMNS, pair_rows(metrics, table))
-    write_json(folder / "results.json", result)
+    write_json(folder / RESULT, result)
 
 
 PAIR_COLUMNS = (

@@ -8,11 +8,11 @@ import torch
 from matplotlib.figure import Figure
 
 from lp_framework.errors import UserError
-from lp_framework.evaluation.runs import find_runs
-from lp_framework.evaluation.sweep_tables import Objects, SweepTable, sweep_tables
 from lp_framework.figures.base import PaperFigure
 from lp_framework.registry import register
-from lp_framework.viz.sweep_pictures import is_swept, sweep_figure
+from lp_framework.report.runs import find_runs
+from lp_framework.report.sweep_figures import is_swept, sweep_figure
+from lp_framework.report.sweep_tables import Objects, SweepTable, sweep_tables
 
 EXPERIMENT, COUNT = "starts", "start.count"
 
@@ -42,7 +42,7 @@ class RecallFigure(PaperFigure[SweepTable]):
         return table
 
     def draw(self, contents: SweepTable) -> Figure:
-        """See `viz.sweep_pictures`."""
+        """See `report.sweep_figures`."""
         figure = sweep_figure(contents)
         assert figure is not None  # the number of starts varies
         return figure

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lp_framework.errors import UserError
-from lp_framework.evaluation.runs import RESULT
+from lp_framework.report.runs import RESULT
 from lp_framework.viz.html.elements import Cell, Html, data_uri, joined, picture, plot, sentence, table
 from lp_framework.viz.html.page import Data
 from lp_framework.viz.html.parts import BROKEN, RunPart, configuration, guarded, read_json, read_rows

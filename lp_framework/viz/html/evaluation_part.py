@@ -12,9 +12,9 @@ import numpy as np
 from lp_framework.errors import UserError
 from lp_framework.evaluation.examples import EXAMPLES, read_examples
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
-from lp_framework.evaluation.report_tables import HEADINGS, number
-from lp_framework.evaluation.runs import RESULT
 from lp_framework.evaluation.tables import COLUMNS, ERRORS, summary_rows
+from lp_framework.report.printed_tables import HEADINGS, number
+from lp_framework.report.runs import RESULT
 from lp_framework.viz.errors_plot import cumulative
 from lp_framework.viz.html.elements import Cell, Html, folded, joined, plot, sentence, table
 from lp_framework.viz.html.page import Data

@@ -6,13 +6,13 @@ import importlib.metadata
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from lp_framework.report.runs import Kind
 from lp_framework.viz.html.elements import Cell, Html, joined, section, sentence, table, tag, tiles
 from lp_framework.viz.html.estimate_part import estimate_part
 from lp_framework.viz.html.evaluation_part import evaluation_part
 from lp_framework.viz.html.landscape_part import landscape_part
 from lp_framework.viz.html.page import Data, write_page
 from lp_framework.viz.html.parts import RunPart
-from lp_framework.viz.html.runs import Kind
 from lp_framework.viz.html.training_part import training_part
 
 PAGE = "report.html"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from lp_framework.evaluation.report_tables import layout
-from lp_framework.evaluation.sweep_tables import SweepTable
+from lp_framework.report.printed_tables import layout
+from lp_framework.report.sweep_tables import SweepTable
 from lp_framework.viz.html.elements import Cell, Html, joined, section, sentence, sheet, table, tag
 
 

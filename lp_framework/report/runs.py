@@ -1,13 +1,14 @@
-"""Finished evaluations on disk: finding their folders, and what was set in each."""
+"""Finished runs on disk: which there are below some folders, and what was set in each evaluation."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import yaml
 from omegaconf import OmegaConf
@@ -15,10 +16,17 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from lp_framework.errors import UserError
+from lp_framework.evaluation.journal import dotted
+from lp_framework.evaluation.tables import RESULT
 
-RESULT = "results.json"
 HYDRA = Path(".hydra") / "hydra.yaml"  # what Hydra keeps of a job: its command and its choices
 COSTS = ("seconds_per_pair", "network_passes_per_pair")
+Kind = Literal["eval", "train", "estimate", "landscape"]  # the commands whose runs have a page
+# What tells a run whose Hydra folder is gone: the first of these files that it has.
+FILES: dict[str, Kind] = {
+    "training.json": "train", "metrics.csv": "train", "landscape.json": "landscape", "azimuth.json": "landscape",
+    "poses.csv": "estimate", RESULT: "eval",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,49 +55,66 @@ class LeftOut(NamedTuple):
     reason: str
 
 
+def run_folders(folders: Sequence[Path]) -> list[tuple[Path, Kind]]:
+    """All runs with a page in and below `folders`, each once, in natural order; `UserError` for a missing folder."""
+    found: dict[Path, tuple[Path, Kind]] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise UserError(f"runs={folder}: there is no such folder")
+        for path, inside, files in os.walk(folder):
+            if not {HYDRA.parent.name, *FILES}.isdisjoint([*inside, *files]) and (kind := run_kind(Path(path))):
+                found[Path(path).resolve()] = Path(path), kind
+    return sorted(found.values(), key=lambda run: [(len(part), part) for part in run[0].parts])
+
+
+def run_kind(folder: Path) -> Kind | None:
+    """The command that made the folder, None where it is none with a page."""
+    command, _ = _job(folder)
+    if command is None:
+        return next((kind for file, kind in FILES.items() if (folder / file).is_file()), None)
+    return next((kind for kind in get_args(Kind) if kind == command), None)
+
+
 def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
     """All finished evaluations in and below `folders`, and those that are unfinished, damaged or repeat another.
 
     Raises `UserError` for a folder that is not there.
     """
-    found: list[Run] = []
+    runs: list[Run] = []
     left_out: list[LeftOut] = []
-    for folder in _run_folders(folders):
-        if not (folder / RESULT).is_file():
-            left_out.append(LeftOut(folder, f"unfinished: no {RESULT}"))
-            continue
+    for folder in [folder for folder, kind in run_folders(folders) if kind == "eval"]:
         try:
-            found.append(read_run(folder))
+            run = read_run(folder)
         except UserError as error:
             left_out.append(LeftOut(folder, str(error)))
-    runs: list[Run] = []
-    for run in found:
+            continue
         same = next((other for other in runs if _identity(other) == _identity(run)), None)
         if same is None:
             runs.append(run)
         else:
-            left_out.append(LeftOut(run.folder, f"repeats {same.folder}: the same settings and seed"))
+            left_out.append(LeftOut(folder, f"repeats {same.folder}: the same settings and seed"))
     return runs, left_out
 
 
 def read_run(folder: Path) -> Run:
-    """The finished evaluation in `folder`; `UserError` where its `results.json` is damaged or no evaluation's."""
+    """The finished evaluation in `folder`; `UserError` where its `results.json` is missing, damaged or another's."""
     file = folder / RESULT
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
-        config = result["config"]
         costs = {name: float(result[name]) for name in COSTS}
         unique = result["metrics_unique_answer"]
         return Run(
             folder,
-            _job(folder)["experiment"],
+            _job(folder)[1],
             int(result["seed"]),
-            {**settings(config), "protocol": result["protocol"], **checkpoint_setting(result["checkpoint"])},
+            {**settings(result["config"]), "protocol": result["protocol"], **checkpoint_setting(result["checkpoint"])},
             {**_metrics(result["metrics"]), **costs},
             None if unique is None else {**_metrics(unique), **costs},
             int(result["pairs"]),
             result["checkpoint"],
         )
+    except FileNotFoundError as error:
+        raise UserError(f"unfinished: no {RESULT}") from error
     except (OSError, ValueError, RecursionError) as error:  # of JSON, too
         raise UserError(f"damaged: {file} cannot be read ({error})") from error
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
@@ -104,21 +129,6 @@ def settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     values = {key: _number(value) for key, value in dotted(config).items() if not _is_left_aside(key)}
     return {key: _longitude_noise(value) if key.endswith(".gamma") else value for key, value in values.items()}
-
-
-def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A config's values by their dotted keys; a list is one value.
-
-    >>> dotted({"seed": 1, "start": {"name": "ring", "count": 4}})
-    {'seed': 1, 'start.name': 'ring', 'start.count': 4}
-    """
-    found: dict[str, Any] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            found |= {f"{key}.{name}": each for name, each in dotted(value).items()}
-        else:
-            found[str(key)] = value
-    return found
 
 
 def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
@@ -154,35 +164,13 @@ def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
     return next((names for names in candidates if len(set(names.values())) == len(names)), candidates[-1])
 
 
-def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The keys whose values differ, with both values; a key that is missing on a side counts as None there.
-
-    >>> differences({"gamma": 0, "steps": 5}, {"gamma": 0.3, "steps": 5})
-    {'gamma': (0, 0.3)}
-    """
-    keys = sorted({*ours, *theirs})
-    return {key: (ours.get(key), theirs.get(key)) for key in keys if ours.get(key) != theirs.get(key)}
-
-
-def _run_folders(folders: Sequence[Path]) -> Iterable[Path]:
-    """Folders in and below `folders` with a result, or made by an `eval`; each once, in natural order."""
-    found: dict[Path, Path] = {}
-    for folder in folders:
-        if not folder.is_dir():
-            raise UserError(f"runs={folder}: there is no such folder")
-        below = [file.parent for file in folder.rglob(RESULT)]
-        below += [file.parent.parent for file in folder.rglob(str(HYDRA)) if _job(file.parent.parent)["name"] == "eval"]
-        found |= {each.resolve(): each for each in below}
-    return sorted(found.values(), key=lambda path: [(len(part), part) for part in path.parts])
-
-
-def _job(folder: Path) -> dict[str, Any]:
-    """The command (`name`) and the `experiment` of the job in `folder`, None where they are not known."""
+def _job(folder: Path) -> tuple[str | None, str | None]:
+    """The command and the experiment of the job in `folder`, None where they are not known."""
     try:
         hydra = yaml.load((folder / HYDRA).read_text(encoding="utf-8"), yaml.CSafeLoader)["hydra"]
-        return {"name": hydra["job"]["name"], "experiment": hydra["runtime"]["choices"].get("experiment")}
+        return hydra["job"]["name"], hydra["runtime"]["choices"].get("experiment")
     except (OSError, YAMLError, ValueError, KeyError, TypeError, AttributeError):
-        return {"name": None, "experiment": None}
+        return None, None
 
 
 def _metrics(values: Mapping[str, float | None]) -> dict[str, float]:

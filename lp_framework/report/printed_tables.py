@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
-from lp_framework.evaluation.paper import PaperRow
-from lp_framework.evaluation.runs import COSTS
-from lp_framework.evaluation.sweep_tables import Row, Spread, SweepTable, in_order
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
+from lp_framework.report.paper import PaperRow
+from lp_framework.report.runs import COSTS
+from lp_framework.report.sweep_tables import Row, Spread, SweepTable, in_order
 
 METRICS = [*COLUMNS, *ERRORS, *COSTS]
 HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passes"], strict=True))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from lp_framework.evaluation.paper import PaperTable, paper_table
-from lp_framework.evaluation.runs import LeftOut, Run, checkpoint_names
+from lp_framework.report.paper import PaperTable, paper_table
+from lp_framework.report.runs import LeftOut, Run, checkpoint_names
 
 Objects = Literal["unique_answer", "all"]
 

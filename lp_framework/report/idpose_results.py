@@ -1,6 +1,6 @@
 """The results that ID-Pose's program writes, judged by our metrics.
 
-    python -m lp_framework.evaluation.idpose_results RESULTS VIEWS
+    python -m lp_framework.report.idpose_results RESULTS VIEWS
 
 RESULTS is its folder of outputs, `<object>_<views>/pose.json`, or one of JSON files that have such names in theirs;
 VIEWS is the data in its layout (`data=omni3d`). A file has the anchor view, our reference, and for each other view
@@ -122,7 +122,7 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
 def main(arguments: Sequence[str]) -> int:
     """Print the row of `RESULTS VIEWS`."""
     if len(arguments) != 2:
-        print("usage: python -m lp_framework.evaluation.idpose_results RESULTS VIEWS", file=sys.stderr)
+        print("usage: python -m lp_framework.report.idpose_results RESULTS VIEWS", file=sys.stderr)
         return 2
     try:
         result = evaluate_idpose(*arguments)

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
-from lp_framework.evaluation.report_tables import heading, shown
-from lp_framework.evaluation.sweep_tables import Row, SweepTable
+from lp_framework.report.printed_tables import heading, shown
+from lp_framework.report.sweep_tables import Row, SweepTable
 from lp_framework.viz.sweeps import COLOURS, Curve, Entry, Panel, curves_figure, entries_figure
 
 AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins
