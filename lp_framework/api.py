@@ -56,7 +56,7 @@ def estimate_pose(
     ]
     if isinstance(solver, str):
         solver = _build_solver(solver, prior, model)
-        move(solver, torch.device("cuda" if torch.cuda.is_available() else "cpu"))
+        move(solver, best_device())
     device = next((each.device for part in solver.networks() for each in part.parameters()), torch.device("cpu"))
     pairs = view_set(prepared, device).pairs([0], [1])
     starting = make_starts(starts) if isinstance(starts, str) else starts
@@ -138,6 +138,12 @@ def view_set(prepared: Sequence[Image.Image], device: torch.device) -> ViewSets:
     """The prepared photographs of one object as the one set of views to solve."""
     views = torch.arange(len(prepared), device=device)[None]
     return ViewSets(image_batch(prepared).to(device), views, ids=torch.zeros_like(views[:, 0]))
+
+
+def best_device() -> torch.device:
+    """The GPU where there is one (CUDA, or Apple's), else the CPU."""
+    found = torch.accelerator.current_accelerator() if torch.accelerator.is_available() else None
+    return torch.device("cpu") if found is None else torch.device(found.type)
 
 
 def move(solver: Solver, device: torch.device) -> None:

@@ -664,7 +664,7 @@ def test_the_table_gives_ratios_of_the_first_to_the_second():
         ),
         ("second_stage.rounds=0", "second_stage.rounds must be at least 1, got 0"),
         ("second_stage.max_batch=0", "second_stage.max_batch must be at least 1 or null, got 0"),
-        ("accelerator=tpu", "accelerator=tpu cannot be had here; choose auto or cpu"),
+        ("accelerator=tpu", "accelerator=tpu is not available on this machine; choose auto or cpu"),
     ],
 )
 def test_mistakes(lp, setting, sentence):

@@ -199,7 +199,7 @@ def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path)
         (["images=photos", "crop=perhaps"], "crop must be true or false, got perhaps"),
         (["images=photos", "radius=0"], "radius must be a positive number, got 0"),
         (["images=photos", "latitude_degrees=90"], "latitude_degrees must lie between -90 and 90, got 90"),
-        (["images=photos", "accelerator=tpu"], "accelerator=tpu cannot be had here"),
+        (["images=photos", "accelerator=tpu"], "accelerator=tpu is not available on this machine"),
     ],
 )
 def test_mistakes_are_met_before_any_model_is_loaded(lp, photos, overrides, error, tmp_path, monkeypatch):

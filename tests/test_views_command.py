@@ -223,7 +223,7 @@ def test_the_prior_that_ships_draws_the_embedded_objects(lp, tmp_path):
         ("steps=2.5", "steps must be a whole number, at least 1, got 2.5"),
         ("guidance=-1", "guidance must be a number, not negative, got -1"),
         ("eta=1.5", "eta must lie in [0, 1], got 1.5"),
-        ("accelerator=tpu", "accelerator=tpu cannot be had here; choose auto or cpu"),
+        ("accelerator=tpu", "accelerator=tpu is not available on this machine; choose auto or cpu"),
     ],
 )
 def test_mistakes(draw, lp, setting, sentence):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import torch
 
+from lp_framework.api import best_device
 from lp_framework.errors import UserError
 
 
 def choose_device(accelerator: str) -> torch.device:
-    """The device of `accelerator=auto`, `cpu` or `cuda`: auto is a GPU where there is one."""
-    available = torch.cuda.is_available()
-    if accelerator not in ("auto", "cpu", "cuda") or (accelerator == "cuda" and not available):
-        raise UserError(f"accelerator={accelerator} cannot be had here; choose auto or cpu")
-    return torch.device("cuda" if available and accelerator != "cpu" else "cpu")
+    """The device of `accelerator=auto` (a GPU where there is one), `cpu`, or a GPU by its type, `cuda` or `mps`."""
+    best = best_device()
+    if accelerator not in ("auto", "cpu", best.type):
+        choices = " or ".join(dict.fromkeys(["auto", "cpu", best.type]))
+        raise UserError(f"accelerator={accelerator} is not available on this machine; choose {choices}")
+    return torch.device("cpu") if accelerator == "cpu" else best
