@@ -261,5 +261,6 @@ Options:
   --multirun, -m         run every combination of key=value,value,...
   --cfg job, -c job      print the configuration without running
   --config-dir, -cd DIR  a folder with your own configs
+  plugins=[DIR]          folders with plugins, besides plugins/ of the working directory
   --info defaults        which files the configuration comes from
   --hydra-help           Hydra's own settings"""

@@ -11,7 +11,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from lp_framework import registry
+import lp_framework
+from lp_framework import catalogue, registry
+from lp_framework.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
@@ -100,3 +102,39 @@ def test_every_setting_has_a_comment(file: Path) -> None:
 
 def test_sources_register_classes_in_every_group() -> None:
     assert {group for group, _ in BUILT_INS} == {*registry.GROUPS}
+
+
+# ---------------------------------------------------------------- what listings, help and the Python API read
+
+
+@pytest.mark.parametrize(("group", "choice"), [*BUILT_INS, *PRESETS], ids=label)
+def test_the_catalogue_reads_what_hydra_composes(group: str, choice: str) -> None:
+    name, values = composed(group, choice)
+    assert catalogue.values(group, choice) == {"name": name, **values}
+    assert catalogue.origin(group, choice) == registry.BUILT_IN
+    assert catalogue.read(f"{group}/{choice}").summary[-1] in ".)"
+
+
+def test_a_preset_is_a_choice_of_the_python_api() -> None:
+    solver = lp_framework.load_solver(
+        "two_stage_without_noise", model=lp_framework.load_model(), prior=lp_framework.load_prior("tiny"), alpha=0.2
+    )
+    assert type(solver) is registry.get("solver", "two_stage")
+    assert (solver.first.gamma, solver.first.alpha) == ([0.0, 0.0, 0.0], 0.2)
+    with pytest.raises(UserError, match="there is no solver 'two_stag'; did you mean 'two_stage'"):
+        lp_framework.load_solver("two_stag")
+
+
+def test_a_file_is_read_with_the_comments_of_its_keys() -> None:
+    parts = catalogue.parse(
+        "# @package _global_\n# What it is,\n# in two lines.\ndefaults:\n  - base\n\na: 1 # one\n# of two parts\n"
+        "b: # both\n  c: 2 # two\n"
+    )
+    assert parts.summary == "What it is, in two lines." and parts.defaults == ["base"]
+    assert parts.settings == {"a": ["a: 1 # one"], "b": ["# of two parts", "b: # both", "  c: 2 # two"]}
+
+
+def test_help_shows_the_choices_of_a_command_and_what_they_can_be_set_to() -> None:
+    text = catalogue.command_help("eval", ["solver=two_stage_without_noise"])
+    assert "solver=two_stage_without_noise: " in text and "  solver.gamma: 0.0 # " in text
+    assert "  protocol: ordered # " in text and "backbone" not in text
