@@ -32,7 +32,7 @@ def estimate_pose(
     query: str | Path | Image.Image | ArrayLike,
     solver: str | Solver = "two_stage",
     prior: str | Prior = "tiny",
-    model: str | Path | PoseModel | None = None,
+    model: str | Path | PoseModel = "score",
     starts: str | Starts = "grid",
     seed: int = 0,
     crop: bool = True,
@@ -46,8 +46,8 @@ def estimate_pose(
     With `crop=False` it is a whole square view, on white where it has no alpha channel.
 
     `solver`, `prior` and `starts` are registered names or objects built by the functions below. A solver by name gets
-    the prior and the model that it asks for (`model` is a checkpoint, a run's folder, or a model; None: the one that
-    ships) on the GPU, where there is one; a built solver has its own.
+    the prior and the model that it asks for (`model` is weights that ship, a checkpoint, a run's folder or a model)
+    on the GPU, where there is one; a built solver has its own.
     """
     remover = BackgroundRemover() if remove_background else None
     prepared = [
@@ -64,12 +64,12 @@ def estimate_pose(
         return solver.solve(pairs, starting.make(pairs, seed), seed)
 
 
-def load_model(checkpoint: str | Path | None = None) -> PoseModel:
-    """The trained model of a checkpoint file, of a training run's folder, or that ships under a name; None: "score".
+def load_model(checkpoint: str | Path = "score") -> PoseModel:
+    """A trained model: weights that ship under a name, a checkpoint file, a training run's folder or a hub id.
 
     Raises `UserError` where there is none.
     """
-    return read_model("score" if checkpoint is None else checkpoint)
+    return read_model(checkpoint)
 
 
 def load_prior(name: str, **arguments: Any) -> Prior:
@@ -96,7 +96,7 @@ def _settings(group: str, name: str, arguments: dict[str, Any]) -> dict[str, Any
     return {**preset, **arguments}
 
 
-def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel | None) -> Solver:
+def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel) -> Solver:
     settings = _settings("solver", name, {})
     wanted = registry.component_names(registry.get("solver", settings["name"]))
     components: dict[str, Any] = {}
