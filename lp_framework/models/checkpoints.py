@@ -67,8 +67,8 @@ def find_checkpoint(name: str | Path) -> Path:
     checkpoint file, a run's folder (its best, else its last checkpoint), a folder that `lp convert` wrote, or the id of
     such a folder on the Hugging Face hub. Raises `UserError` where there is none.
     """
-    if (SHIPPED / str(name) / WEIGHTS).is_file():
-        return SHIPPED / str(name) / WEIGHTS
+    if name in [folder.name for folder in SHIPPED.iterdir()]:
+        return SHIPPED / name / WEIGHTS
     if name == LATEST:
         return latest_checkpoint()
     path = Path(name)
