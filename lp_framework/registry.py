@@ -62,7 +62,6 @@ class _State:
     failures: dict[str, str] = field(default_factory=dict)
     conf_folders: list[Path] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # plugins already tried, by folder or entry point
-    folders: list[Path] = field(default_factory=list)  # those given to `discover`
     loading: str | None = None  # origin of the plugin being imported
 
 
@@ -144,11 +143,6 @@ def conf_folders() -> list[Path]:
     """The `conf/` folders that plugins bring, in the order in which the plugins were found."""
     discover()
     return list(_state.conf_folders)
-
-
-def plugin_folders() -> list[Path]:
-    """The folders given to `discover` so far."""
-    return list(_state.folders)
 
 
 # ---------------------------------------------------------------- building
@@ -253,11 +247,8 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
     for folder in map(Path, folders):
         if not folder.is_dir():
             raise UserError(f"plugins=[{folder}]: there is no such folder (looked in {Path.cwd()})")
-        path = folder.resolve()
-        if not _load_folder(path):
+        if not _load_folder(folder.resolve()):
             raise UserError(f"plugins=[{folder}]: neither this folder nor a folder in it holds Python files")
-        if path not in _state.folders:
-            _state.folders.append(path)
 
 
 @cache
