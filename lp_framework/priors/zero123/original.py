@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lp_framework.errors import UserError
 from lp_framework.priors.zero123.networks import Configs, Weights, clip_config, unet_config, vae_config
+from lp_framework.priors.zero123.original_names import clip_modules, renamed, unet_modules, vae_modules
 from lp_framework.priors.zero123.stored_tensor import StoredTensor
 from lp_framework.priors.zero123.torch_file import read_state_dict
 
@@ -49,28 +50,19 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
         )
     unet, vae, clip, projection = (_part(tensors, prefix) for prefix in (UNET, VAE, VISUAL, PROJECTION))
     try:
-        vae_sizes = _vae_sizes(vae)
-        configs = {
-            "unet": _unet_sizes(unet),
-            "vae": vae_sizes,
-            "image_encoder": _clip_sizes(clip),
-        }
-        names = {
-            "unet": _unet_names(unet, configs["unet"]["layers_per_block"]),
-            "vae": _vae_names(vae, len(vae_sizes["block_out_channels"])),
-        }
+        configs = {"unet": _unet_sizes(unet), "vae": _vae_sizes(vae), "image_encoder": _clip_sizes(clip)}
     except KeyError as error:
         raise UserError(f"{path}: is no Zero123 checkpoint: it holds no '{error.args[0]}'") from error
     except (IndexError, ValueError) as error:  # tensors of too few or too many dimensions
         raise UserError(f"{path}: is no Zero123 checkpoint: its tensors have other shapes") from error
     chosen = unet if weights == "raw" else _averages(path, tensors, unet)
+    unet_names, vae_names = unet_modules(configs["unet"]), vae_modules(configs["vae"])
     return configs, {
-        "unet": {name: chosen[key].map for key, name in names["unet"].items()},
-        "vae": {name: partial(_matrix, vae[key]) if ".attentions." in name and name.endswith("weight") else vae[key].map
-                for key, name in names["vae"].items()},
-        "image_encoder": _clip_tensors(clip),
+        "unet": {renamed(key, unet_names): stored.map for key, stored in chosen.items()},
+        "vae": {renamed(key, vae_names): partial(_matrix, key, stored) for key, stored in vae.items()},
+        "image_encoder": _clip_tensors(clip, clip_modules(configs["image_encoder"])),
         "cc_projection": {name: stored.map for name, stored in projection.items()},
-    }  # fmt: skip
+    }
 
 
 class _Part(dict[str, StoredTensor]):
@@ -133,49 +125,6 @@ def _heads(channels: int) -> int:
     return min(8, channels // 8)
 
 
-RESNET = {
-    **{"in_layers.0": "norm1", "in_layers.2": "conv1", "emb_layers.1": "time_emb_proj"},
-    **{"out_layers.0": "norm2", "out_layers.3": "conv2", "skip_connection": "conv_shortcut"},
-}
-UNET_ENDS = {
-    **{"time_embed.0": "time_embedding.linear_1", "time_embed.2": "time_embedding.linear_2"},
-    **{"input_blocks.0.0": "conv_in", "out.0": "conv_norm_out", "out.2": "conv_out"},
-}
-
-
-def _unet_names(keys: Iterable[str], layers: int) -> dict[str, str]:
-    """Diffusers' name of each of the U-Net's tensors; an unknown one keeps its own."""
-    return {key: _unet_name(key, layers) for key in keys}
-
-
-def _unet_name(key: str, layers: int) -> str:
-    module, _, kind = key.rpartition(".")  # kind: weight or bias
-    if module in UNET_ENDS:
-        return f"{UNET_ENDS[module]}.{kind}"
-    match = re.fullmatch(r"(input_blocks|output_blocks)\.(\d+)\.(\d+)\.(.+)|middle_block\.(\d+)\.(.+)", key)
-    if match is None:
-        return key
-    if match[5] is not None:
-        block, place, rest = "mid_block", int(match[5]), match[6]
-        inner = "attentions.0" if place == 1 else f"resnets.{place // 2}"
-        return f"{block}.{inner}.{rest if place == 1 else _resnet_name(rest)}"
-    number, place, rest = int(match[2]), int(match[3]), match[4]
-    if match[1] == "input_blocks":  # the first is conv_in; then each level's residual blocks and its downsampling
-        level, layer = divmod(number - 1, layers + 1)
-        block, sampler = f"down_blocks.{level}", f"downsamplers.0.conv.{kind}"
-    else:  # a level has one residual block more, and the upsampling in its last
-        level, layer = divmod(number, layers + 1)
-        block, sampler = f"up_blocks.{level}", f"upsamplers.0.conv.{kind}"
-    if rest in (f"op.{kind}", f"conv.{kind}"):
-        return f"{block}.{sampler}"
-    return f"{block}.resnets.{layer}.{_resnet_name(rest)}" if place == 0 else f"{block}.attentions.{layer}.{rest}"
-
-
-def _resnet_name(rest: str) -> str:
-    module, _, kind = rest.rpartition(".")
-    return f"{RESNET.get(module, module)}.{kind}"
-
-
 # ---------------------------------------------------------------- the autoencoder
 
 
@@ -186,36 +135,10 @@ def _vae_sizes(vae: _Part) -> dict[str, Any]:
     return vae_config(channels, layers, latent=vae["post_quant_conv.weight"].shape[0])
 
 
-VAE_MODULES = (  # pattern, replacement
-    (r"\.norm_out\.", ".conv_norm_out."),
-    (r"\.nin_shortcut\.", ".conv_shortcut."),
-    (r"\.mid\.block_(\d)\.", lambda match: f".mid_block.resnets.{int(match[1]) - 1}."),
-    (r"\.mid\.attn_1\.norm\.", ".mid_block.attentions.0.group_norm."),
-    (r"\.mid\.attn_1\.([qkv])\.", r".mid_block.attentions.0.to_\1."),
-    (r"\.mid\.attn_1\.proj_out\.", ".mid_block.attentions.0.to_out.0."),
-    (r"\.down\.(\d+)\.block\.", r".down_blocks.\1.resnets."),
-    (r"\.down\.(\d+)\.downsample\.", r".down_blocks.\1.downsamplers.0."),
-)
-
-
-def _vae_names(keys: Iterable[str], levels: int) -> dict[str, str]:
-    """Diffusers' name of each of the autoencoder's tensors; the decoder's levels are counted from the other end."""
-    names = {}
-    for key in keys:
-        name = key
-        for pattern, replacement in VAE_MODULES:
-            name = re.sub(pattern, replacement, name)
-        if match := re.fullmatch(r"decoder\.up\.(\d+)\.(block|upsample)\.(.+)", name):
-            inner = "resnets" if match[2] == "block" else "upsamplers.0"
-            name = f"decoder.up_blocks.{levels - 1 - int(match[1])}.{inner}.{match[3]}"
-        names[key] = name
-    return names
-
-
-def _matrix(stored: StoredTensor) -> Tensor:
-    """The weights of an attention's 1x1 convolution as a matrix; those of its norm as they are."""
+def _matrix(key: str, stored: StoredTensor) -> Tensor:
+    """The weights of an attention's 1x1 convolution as a matrix; other tensors as they are."""
     weights = stored.map()
-    return weights.flatten(1) if weights.ndim == 4 else weights
+    return weights.flatten(1) if ".attn_1." in key and weights.ndim == 4 else weights
 
 
 # ---------------------------------------------------------------- CLIP
@@ -228,37 +151,18 @@ def _clip_sizes(clip: _Part) -> dict[str, Any]:
     return clip_config(width, layers, patch, patch * math.isqrt(patches), projection=clip["proj"].shape[1])
 
 
-CLIP_MODULES = (  # prefix, replacement
-    ("class_embedding", "embeddings.class_embedding"),
-    ("positional_embedding", "embeddings.position_embedding.weight"),
-    ("conv1.", "embeddings.patch_embedding."),
-    ("ln_pre.", "pre_layrnorm."),  # sic
-    ("ln_post.", "post_layernorm."),
-    ("transformer.resblocks.", "encoder.layers."),
-)
-CLIP_LAYER = (
-    *((".ln_1.", ".layer_norm1."), (".ln_2.", ".layer_norm2."), (".attn.", ".self_attn.")),
-    *((".mlp.c_fc.", ".mlp.fc1."), (".mlp.c_proj.", ".mlp.fc2.")),
-)
-
-
-def _clip_tensors(clip: _Part) -> dict[str, Callable[[], Tensor]]:
+def _clip_tensors(clip: _Part, modules: Mapping[str, str]) -> dict[str, Callable[[], Tensor]]:
     """Transformers' names; queries, keys and values are one tensor in OpenAI's, and the projection is transposed."""
     tensors: dict[str, Callable[[], Tensor]] = {}
     for key, stored in clip.items():
-        name = key
-        for prefix, replacement in CLIP_MODULES:
-            if name.startswith(prefix):
-                name = replacement + name[len(prefix) :]
-        for inner, replacement in CLIP_LAYER:
-            name = name.replace(inner, replacement)
+        name = renamed(key, modules)
         if key == "proj":
             tensors["visual_projection.weight"] = partial(_transposed, stored)
         elif match := re.fullmatch(r"(.+)\.in_proj_(weight|bias)", name):
             for place, letter in enumerate("qkv"):
-                tensors[f"vision_model.{match[1]}.{letter}_proj.{match[2]}"] = partial(_third, stored, place)
+                tensors[f"{match[1]}.{letter}_proj.{match[2]}"] = partial(_third, stored, place)
         else:
-            tensors[f"vision_model.{name}"] = stored.map
+            tensors[name] = stored.map
     return tensors
 
 
