@@ -1,7 +1,8 @@
 """Tensors of a safetensors file, mapped one at a time.
 
 The format: the length of the header (8 bytes, little-endian), the header in JSON, which gives each tensor's type, shape
-and place, and the bytes. The library maps a file as a whole, so that what has been copied from it stays in memory.
+and place, and the bytes. There is a reader of our own beside the safetensors library because the library maps a file as
+a whole, so that what has been copied from it stays in memory (see `stored_tensor`).
 """
 
 from __future__ import annotations

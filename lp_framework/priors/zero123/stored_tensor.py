@@ -1,4 +1,10 @@
-"""A tensor's place in a file."""
+"""A tensor's place in a file, from which it is mapped alone.
+
+PyTorch and safetensors map a whole file: each page that a tensor was copied from stays in memory until the last tensor
+is done, so that loading into another dtype takes the file and the result. A mapping of its own for each tensor ends
+with it; the peak of memory is then about the weights that are kept, a sixth of what whole mappings take of a checkpoint
+with moving averages and optimizer states.
+"""
 
 from __future__ import annotations
 

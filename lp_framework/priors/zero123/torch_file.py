@@ -1,12 +1,14 @@
 """Tensors in a PyTorch file, read one at a time; nothing that the file says is ever run.
 
 A file of `torch.save` is a zip archive: a pickle that describes the contents, and the bytes of each tensor as a record.
-The pickle is read by an unpickler that knows tensors and plain containers. Published checkpoints also mention classes
-of their training code, callbacks of PyTorch Lightning above all, which `torch.load(weights_only=True)` refuses;
-those become objects of an empty class here. A name from anywhere else is refused: such a file wants to run code.
-(Before torch 2.6 `weights_only` itself could be made to run code, CVE-2025-32434, so it would be no safeguard.)
+`torch.load` reads it, too, but there are two reasons for a reader of our own:
 
-Tensors are mapped from the file one by one when they are asked for, so optimizer states take no memory.
+- *No code is run.* Published checkpoints mention classes of their training code, callbacks of PyTorch Lightning above
+  all, which `torch.load(weights_only=True)` refuses, and without that argument unpickling runs whatever a file names.
+  The unpickler here knows tensors and plain containers, and makes objects of an empty class of the training code's;
+  a name from anywhere else is refused. (Before torch 2.6 `weights_only` itself could be made to run code,
+  CVE-2025-32434.)
+- *Memory.* Tensors are mapped one by one when they are asked for (see `stored_tensor`), so optimizer states take none.
 """
 
 from __future__ import annotations
