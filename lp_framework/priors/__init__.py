@@ -1,7 +1,7 @@
 """Pose-conditioned diffusion priors; importing the package registers them."""
 
-from lp_framework.priors.tiny import prior as tiny
-from lp_framework.priors.tiny import training
-from lp_framework.priors.zero123 import prior as zero123
+from lp_framework.priors.tiny import prior as tiny_prior
+from lp_framework.priors.tiny import training as tiny_training
+from lp_framework.priors.zero123 import prior as zero123_prior
 
-__all__ = ["tiny", "training", "zero123"]
+__all__ = ["tiny_prior", "tiny_training", "zero123_prior"]
