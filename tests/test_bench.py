@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 import numpy as np
@@ -16,30 +15,41 @@ from view_folders import write_objects
 from zero123_checkpoint import state_dict, write_checkpoint
 
 from lp_framework import registry
-from lp_framework.benchmarks import arithmetic, contest, first_stage, loader, rendering, second_stage
+from lp_framework.benchmarks import arithmetic, harness, loader, precision, rendering, scaling, second_stage
 from lp_framework.benchmarks import pair as whole_pair
-from lp_framework.benchmarks.adam_gauss_newton import Encoded, followed, some_pairs
-from lp_framework.benchmarks.arithmetic import Arithmetic, Peak, counted, launched
-from lp_framework.benchmarks.contest import Match, compete
-from lp_framework.benchmarks.encoding import loss_on, trunk_features
-from lp_framework.benchmarks.first_stage import all_pairs
+from lp_framework.benchmarks.adam_gauss_newton import followed, some_pairs
+from lp_framework.benchmarks.arithmetic import Arithmetic, counted, launched
+from lp_framework.benchmarks.encoding import trunk_features
+from lp_framework.benchmarks.first_stage import all_pairs, plain_loop
+from lp_framework.benchmarks.harness import Contest, Section
+from lp_framework.benchmarks.loader import loss_on
 from lp_framework.benchmarks.memory import peak_bytes
 from lp_framework.benchmarks.original_layout import original_tensors, write_original
-from lp_framework.benchmarks.precision import Precision, Variant
-from lp_framework.benchmarks.scaling import Scaling, exponent
-from lp_framework.benchmarks.second_stage import BATCHED, LOOP, TIMESTEP, Batched, PlainLoop, SecondStage
-from lp_framework.benchmarks.section import Figure, Section
-from lp_framework.commands.bench import MEASUREMENTS, table
-from lp_framework.data.meshes import MeshObject
+from lp_framework.benchmarks.precision import variant
+from lp_framework.benchmarks.scaling import exponent
+from lp_framework.benchmarks.second_stage import (
+    BATCHED,
+    LOOP,
+    TIMESTEP,
+    Computing,
+    PlainLoop,
+    arithmetic_of,
+    batched,
+    encoded,
+    held_bytes,
+    plain_prior,
+    random_pair,
+)
+from lp_framework.commands.bench import MEASUREMENTS, paper_seconds, table
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
 from lp_framework.models.checkpoints import SHIPPED, load_model
-from lp_framework.priors.zero123.networks import Networks
 from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.gauss_newton import GaussNewton
+from lp_framework.solvers.ifusion import IFusion
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
@@ -66,16 +76,15 @@ FEW = {
 }  # fmt: skip
 
 
-def narrow(**settings) -> SecondStage:
-    plain = {"rounds": 2, "steps": 1, "dtype": "float32", "channels_last": False, "compile": False, "cuda_graph": False}
-    plain |= {"architecture": "narrow", "starts": [1, 2], "attention": "sdpa", "max_batch": None, **settings}
-    return SecondStage(CPU, **plain)
+@pytest.fixture(scope="module")
+def networks():
+    torch.manual_seed(0)
+    return Computing("narrow").networks(CPU)
 
 
 @pytest.fixture(scope="module")
-def priors():
-    torch.manual_seed(0)
-    return narrow().priors()
+def priors(networks):
+    return Computing("narrow").prior(networks), plain_prior(networks)
 
 
 @pytest.fixture(scope="module")
@@ -127,13 +136,13 @@ def test_both_contenders_descend_the_same_energy(priors, images, pairs):
 
 
 def test_a_batched_step_encodes_nothing_and_passes_the_network_once(priors, pairs):
-    batch_prior, _ = priors
-    batched = Batched(PairEnergy(batch_prior, pairs, seed=0), Ring(3).make(pairs, seed=0))
-    before = batched.poses.detach().clone()
-    with Passes(batch_prior) as counts:
-        batched.step()
+    ready = encoded(priors[0], priors[0].encode(pairs.images))
+    starts = Ring(3).make(pairs, seed=0)
+    with Passes(priors[0]) as counts:
+        assert batched(ready, pairs, starts, 1)() == 1
     assert counts == {"vae": [], "clip": [], "unet": [6]}  # three starts in two directions
-    assert ((batched.poses.detach() - before).abs().amax(dim=-1) > 0).all()
+    moved = IFusion(ready, 1).solve(pairs, starts, seed=0).poses
+    assert ((moved - starts).abs().amax(dim=-1) > 0).all()
 
 
 def test_a_step_of_the_plain_loop_encodes_every_image_anew(priors, images):
@@ -147,65 +156,54 @@ def test_a_step_of_the_plain_loop_encodes_every_image_anew(priors, images):
     assert loop.twist.abs().max() > 0 and loop.total > 0
 
 
-def test_the_contenders_share_memory_only_where_nothing_is_converted():
+def test_the_contenders_share_memory_only_where_nothing_is_converted(networks):
     for dtype, shared in (("float32", True), ("bfloat16", False)):
-        batch_prior, loop_prior = narrow(dtype=dtype).priors()
+        batch_prior, loop_prior = Computing("narrow", dtype).prior(networks), plain_prior(networks)
         one, other = batch_prior.unet.conv_in.weight, loop_prior.unet.conv_in.weight
         assert (one.data_ptr() == other.data_ptr()) is shared
         assert other.dtype == torch.float32 and not one.requires_grad and not other.requires_grad
         torch.testing.assert_close(one.float(), other, rtol=1e-2, atol=0)
+        assert networks.unet.dtype == torch.float32 and batch_prior.cc_projection.weight.dtype == torch.float32
 
 
 # ---------------------------------------------------------------- the measurement
 
 
 @pytest.fixture
-def uncounted(monkeypatch):
-    """Operations are not counted anew."""
-    work = {BATCHED: Arithmetic(600, Peak(100.0, "told")), LOOP: Arithmetic(900, Peak(100.0, "told"))}
-    monkeypatch.setattr(SecondStage, "work", lambda self: work)
-
-
-def test_the_section_grows_with_every_stretch(monkeypatch, uncounted):
-    seconds = iter(np.random.default_rng(0).uniform(1, 2, 100).tolist())
-    monkeypatch.setattr(SecondStage, "run", lambda self, runner, prior, steps: (next(seconds), 0))
-    sections = list(narrow().measure())
-    shares = [section.done for section in sections]
-    assert shares == sorted(shares) and shares[-1] == 1
-    assert not sections[0].figures and sections[0].record["starts"] == {}
-    first = next(section for section in sections if section.figures)
-    assert list(first.record["starts"]) == ["1"]  # of the first round, when two starts have not been looked at
-    last = sections[-1]
-    rows = [f"{starts}, {what}" for starts in ("1 start", "2 starts") for what in ("seconds a step", "share of peak")]
-    assert [figure.label for figure in last.figures] == rows
-    for figure, entry in zip(last.figures[::2], last.record["starts"].values(), strict=True):
-        assert all(len(entry[name]["rounds"]) == 2 for name in (BATCHED, LOOP))
-        assert figure.first == entry[BATCHED]["seconds_per_step"] == pytest.approx(sum(entry[BATCHED]["rounds"]) / 2)
-        assert entry["ratio"]["seconds_per_step"] == pytest.approx(figure.first / figure.second)
-
-
-def test_rounds_alternate_and_the_loop_takes_its_starts_in_turn(monkeypatch, uncounted):
-    steps = []
+def steps(monkeypatch):
+    """What the contenders do, instead of which nothing is done, and operations are not counted anew."""
+    done = []
 
     def longitude(loop):
         return round(torch.rad2deg(loop.poses(loop.twist)[1]).item())
 
-    monkeypatch.setattr(Batched, "step", lambda self: steps.append(self.poses.shape[1]))
-    monkeypatch.setattr(PlainLoop, "step", lambda self: steps.append(f"at {longitude(self)}"))
-    list(narrow(steps=2).measure())
-    warm_up = [1, "at 0"]
-    assert steps == [*warm_up, *[1, 1, "at 0", "at 0", 2, 2, "at 0", "at 0", "at 180", "at 180"] * 2]
+    def solve(solver, pairs, starts, seed):
+        done.append(f"{solver.settings.steps} of {starts.shape[1]}")
+
+    monkeypatch.setattr(IFusion, "solve", solve)
+    monkeypatch.setattr(PlainLoop, "step", lambda self: done.append(f"at {longitude(self)}"))
+    work = {BATCHED: Arithmetic(600, 100.0), LOOP: Arithmetic(900, 100.0)}
+    monkeypatch.setattr(second_stage, "arithmetic_of", lambda computing, device: work)
+    return done
 
 
-def test_seconds_are_those_of_one_step_of_all_starts(monkeypatch, uncounted):
-    monkeypatch.setattr(SecondStage, "run", lambda self, runner, prior, steps: (3.0 * steps, 1000))
-    *_, last = narrow(steps=4).measure()
-    seconds = {figure.label: (figure.first, figure.second) for figure in last.figures}
-    assert seconds["2 starts, seconds a step"] == (3, 6)
-    assert seconds["2 starts, peak memory, GB"] == (1e-6, 1e-6)
-    assert seconds["2 starts, share of peak"] == (2 * 6 / 3, 2 * 9 / 6)
-    assert last.record["arithmetic_per_start"][BATCHED]["operations"] == 600
-    assert last.record["starts"]["2"]["ratio"] == {"seconds_per_step": 0.5, "peak_bytes": 1}
+def test_rounds_alternate_and_the_loop_takes_its_starts_in_turn(steps):
+    sections = second_stage.measure(Computing("narrow"), [1, 2], rounds=2, steps=2, device=CPU)
+    shares = [section.done for section in sections]
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1)
+    warm_up = ["1 of 1", "2 of 1", "1 of 1", "at 0"]  # twice to count launches
+    assert steps == [*warm_up, *["2 of 1", *["at 0"] * 2, "2 of 2", *["at 0"] * 2, *["at 180"] * 2] * 2]
+
+
+def test_seconds_are_those_of_one_step_of_all_starts(steps, monkeypatch):
+    monkeypatch.setattr(harness, "timed", lambda work, device: (12.0, work()))
+    *_, last = second_stage.measure(Computing("narrow"), [1, 2], rounds=1, steps=4, device=CPU)
+    rows = {row.label: row.medians for row in last.rows}
+    assert rows == {
+        "1 start, seconds a step": (3, 3), "2 starts, seconds a step": (3, 3),
+        "1 start, share of peak": (6 / 3, 9 / 3), "2 starts, share of peak": (2 * 6 / 3, 2 * 9 / 3),
+    }  # fmt: skip
+    assert last.facts["arithmetic_per_start"][BATCHED]["operations"] == 600
 
 
 # ---------------------------------------------------------------- the loaders
@@ -238,25 +236,25 @@ def test_a_batch_in_feature_space_has_fewer_images_than_pairs(views):
 
 
 def test_contenders_take_turns_after_a_warm_up(monkeypatch):
-    done = []
-    monkeypatch.setattr(contest, "timed", lambda work, device: (2.0, work()))
+    done, seconds = [], iter([2.0, 2, 2, 2, 2, 4, 2, 2])
+    monkeypatch.setattr(harness, "timed", lambda work, device: (next(seconds), work()))
 
     def work(name, amount):
-        return lambda: (done.append(name), amount)[1]
+        return harness.worth(amount, lambda: done.append(name))
 
-    matches = [
-        Match("quick", "a second", work("a", 8), work("b", 4)),
-        Match("slow", "seconds", work("c", 1), work("d", 2), rate=False),
+    contests = [
+        Contest("a second", work("a", 8), work("b", 4), rate=True),
+        Contest("seconds", work("c", 1), work("d", 2)),
     ]
-    sections = list(compete("race", ("new", "old"), matches, 2, CPU, "as ever"))
+    section = Section("race", ("new", "old"), "as ever")
+    rows = [(each.done, [row.label for row in each.measured()]) for each in section.race(contests, 2, CPU)]
     assert done == [*"abcd"] * 3
-    assert [section.done for section in sections] == [stretch / 8 for stretch in range(1, 9)]
-    assert not sections[0].figures and not sections[0].record
-    last = sections[-1]
-    assert last.figures == [Figure("a second", 4, 2), Figure("seconds", 2, 1)] and last.note == "as ever"
-    assert last.record["quick"] == {
-        "new": {"median": 4, "rounds": [4, 4]}, "old": {"median": 2, "rounds": [2, 2]}, "ratio": 2,
-    }  # fmt: skip
+    assert [share for share, _ in rows] == pytest.approx([stretch / 8 for stretch in range(1, 9)])
+    assert rows[0][1] == [] and rows[1][1] == ["a second"] and rows[3][1] == ["a second", "seconds"]
+    assert [row.medians for row in section.rows] == [(4, 1.5), (2, 1)] and section.rows[0].ratio == pytest.approx(8 / 3)
+    record = section.record()
+    assert record["a second"]["old"] == {"median": 1.5, "min": 1, "max": 2, "rounds": [2, 1]}
+    assert record["seconds"]["ratio"] == 2
 
 
 def test_operations_are_those_of_matrix_products_and_convolutions():
@@ -272,39 +270,30 @@ def test_launches_are_what_computes():
     assert launched(lambda: torch.empty(4, 4).copy_(matrix.t()[1:].reshape(12).sum() + matrix.view(2, 8)[0, 0])) == 4
 
 
-def test_a_batched_step_has_as_many_launches_from_few_starts_as_from_many(priors, pairs):
-    energy = PairEnergy(priors[0], pairs, seed=0)
-    two, four = (launched(Batched(energy, Ring(count).make(pairs, seed=0)).step) for count in (2, 4))
-    assert two == four > 300
+def test_a_step_has_as_many_operations_as_starts_and_its_launches_do_not_depend_on_them():
+    meta = torch.device("meta")
+    energy = PairEnergy(Computing().prior(Computing("narrow").networks(meta)), random_pair(meta), seed=0)
+    noise = torch.empty(1, 2, *energy.prior.latent_shape, device=meta)
 
+    def step(count):
+        poses = torch.zeros(1, count, 3, device=meta, requires_grad=True)
+        return lambda: energy(poses, TIMESTEP, noise).sum().backward()
 
-def test_a_step_has_as_many_operations_as_starts():
-    work = narrow().work()
-    assert Precision(CPU, "narrow", [], 3, 1, 1, None).operations() == 3 * work[BATCHED].operations
+    work = arithmetic_of(Computing("narrow"), CPU)
+    assert counted(step(3)) == 3 * work[BATCHED].operations
+    assert launched(step(2)) == launched(step(4)) > 300
     assert work[LOOP].operations > 2 * work[BATCHED].operations  # it encodes, too
+    assert work[LOOP].launches > launched(step(1))
 
 
-@pytest.mark.parametrize(
-    ("name", "half", "single"),
-    [("NVIDIA H100 80GB HBM3", 989, 495), ("NVIDIA H100 PCIe", 756, 378), ("NVIDIA RTX 6000 Ada Generation", 364, 182),
-     ("NVIDIA L4", 121, 60), ("NVIDIA L40S", 362, 183), ("NVIDIA A100-SXM4-80GB", 312, 156)],
-)  # fmt: skip
-def test_peaks_of_known_devices_are_those_of_their_data_sheets(monkeypatch, name, half, single):
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: name)
-    for dtype, rate in ((torch.bfloat16, half), (torch.float16, half), (torch.float32, single)):
-        assert arithmetic.peak(torch.device("cuda"), dtype) == (rate * 1e12, "data sheet")
-
-
-def test_an_unknown_device_is_measured(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Another GPU")
-    monkeypatch.setattr(arithmetic, "matmul_rate", lambda device, dtype: 7.0)
-    assert arithmetic.peak(torch.device("cuda"), torch.float16) == (7.0, "matrix product")
-    work = Arithmetic(14, arithmetic.peak(CPU, torch.float32))
-    assert work.share(seconds=4.0) == 0.5 and work.record()["peak_source"] == "matrix product"
+def test_the_share_of_the_peak():
+    work = Arithmetic(operations=14 * 10**9, peak=7e9, launches=2260)
+    assert work.share(seconds=4.0) == 0.5
+    assert str(work) == "14 GFLOP in 2,260 launches, the device's peak 0.007 TFLOP/s"
 
 
 def test_the_rate_of_a_matrix_product_is_positive():
-    assert arithmetic.matmul_rate(CPU, torch.float32) > 1e8
+    assert arithmetic.peak_rate(CPU, torch.float32) > 1e8
 
 
 def test_peak_memory_is_that_of_tensors_alive_at_once():
@@ -347,9 +336,7 @@ def test_a_gpus_memory_is_what_its_allocator_says(monkeypatch):
     allocator.most = 5000  # of what was before
     assert peak_bytes(allocator.step, gpu) == 30
     allocator.most = 5000
-    prior = torch.nn.Linear(3, 2)
-    seconds, peak = dataclasses.replace(narrow(), device=gpu).run(allocator, prior, steps=1)
-    assert peak == 30 + 4 * (6 + 2) and seconds >= 0
+    assert held_bytes(allocator.step, torch.nn.Linear(3, 2), gpu) == 30 + 4 * (6 + 2)
 
 
 # ---------------------------------------------------------------- encoding and the first stage
@@ -366,7 +353,11 @@ def test_training_on_features_kept_is_training_on_both_images_of_every_pair(view
     pairs = views.table.pairs("ordered")[::5]
     once = views[pairs]
     batches = [views[pair[None]] for pair in pairs]
-    losses = [loss_on(pose_model, batch, trunk_features(pose_model, batch.images)) for batch in (once, *batches)]
+    losses = []
+    for batch in (once, *batches):
+        features = pose_model.backbone.head(trunk_features(pose_model, batch.images))
+        losses.append(loss_on(pose_model, batch, CPU, features))
+        torch.testing.assert_close(losses[-1], loss_on(pose_model, batch, CPU))
     whole, apart = losses[0], torch.stack(losses[1:]).mean()
     torch.testing.assert_close(whole, apart)
     parameters = [*pose_model.network.parameters()]
@@ -381,7 +372,7 @@ def test_the_first_stage_as_a_loop_ends_where_the_batch_does(pose_model):
     assert len(pairs) == 6 and len(pairs.images) == 3
     starts = Ring(2).make(pairs, seed=0)
     batched = solver.solve(pairs, starts, seed=0).poses
-    loop = first_stage.PlainLoop(solver).solve(pairs, starts)
+    loop = plain_loop(solver, pairs, starts)
     loop[..., 1] = wrap_angle(loop[..., 1]) % (2 * torch.pi)
     torch.testing.assert_close(loop, batched, rtol=1e-4, atol=1e-4)
 
@@ -393,8 +384,9 @@ def test_a_prior_whose_images_are_encoded_has_the_same_energy_and_gradient():
     pairs, true = exact_pairs(3)
     prior = ExactPrior([0.0, 2.0], [0.0, 0.3], noisy=0.3)
     found = []
-    for each in (prior, Encoded(prior, pairs.images)):
+    for each in (prior, encoded(prior, prior.encode(pairs.images))):
         energy = PairEnergy(each, pairs, seed=0)
+        assert len(energy.codes) == len(pairs.images)
         poses = around(true, 0.3, -0.4).requires_grad_()
         values = energy(poses, 100, energy.noise(0)[:, 0])
         found.append((values.detach(), torch.autograd.grad(values.sum(), poses)[0]))
@@ -447,17 +439,15 @@ def test_a_renderer_that_cannot_work_here_is_named():
         def views(self, *arguments):
             raise UserError("no light")
 
-    box = MeshObject("box", "unique", lambda: trimesh.Scene(coloured_box()))
     both = {"broken": Broken(), "raycast": RaycastRenderer()}
-    *_, last = rendering.measure(box, both, 2, 8, 1, CPU)
-    assert [figure.label for figure in last.figures] == ["raycast, views a second"] and last.note.endswith("no light")
+    *_, last = rendering.measure("duck", both, 2, 8, 1, CPU)
+    assert [row.label for row in last.rows] == ["raycast, views a second"] and last.note.endswith("no light")
     with pytest.raises(UserError, match="nothing to render with here: no light"):
-        list(rendering.measure(box, {"broken": Broken()}, 2, 8, 1, CPU))
+        list(rendering.measure("duck", {"broken": Broken()}, 2, 8, 1, CPU))
 
 
 @pytest.mark.parametrize("weights", ["ema", "raw"])
-def test_a_checkpoint_in_the_original_layout_is_read_back(priors, tmp_path, weights):
-    networks = Networks(second_stage.ARCHITECTURES["narrow"])
+def test_a_checkpoint_in_the_original_layout_is_read_back(networks, tmp_path, weights):
     write_original(networks, tmp_path / "original.ckpt")
     read = load_networks(str(tmp_path / "original.ckpt"), None, weights, "float32")
     before, after = networks.state_dict(), read.state_dict()
@@ -479,19 +469,21 @@ def test_the_original_layout_is_the_published_one(tmp_path):
 
 
 def test_a_pair_is_encoded_once_here_and_at_every_step_of_the_loop(priors, monkeypatch):
-    monkeypatch.setattr(SecondStage, "priors", lambda stage: priors)
+    monkeypatch.setattr(Computing, "networks", lambda computing, device: None)
+    monkeypatch.setattr(Computing, "prior", lambda computing, networks: priors[0])
+    monkeypatch.setattr(whole_pair, "plain_prior", lambda networks: priors[1])
     with Passes(priors[0]) as ours, Passes(priors[1]) as loop:
-        *_, last = whole_pair.measure(narrow(), load_model(SHIPPED / "score"), [2], steps=3, rounds=1)
+        model = load_model(SHIPPED / "score")
+        *_, last = whole_pair.measure(Computing("narrow"), model, {}, [2], steps=3, rounds=1, device=CPU)
     assert ours == {"vae": [2] * 2, "clip": [2] * 2, "unet": [4] * 2 * 3}  # the first pair, and one more
     steps = 1 + 2 * 3  # to warm up, and of either start
     assert loop == {"vae": [2] * 2 * steps, "clip": [2] * steps, "unet": [2] * steps}
-    assert [figure.label for figure in last.figures] == ["2 starts, seconds a pair"] and last.done == 1
+    assert [row.label for row in last.rows] == ["2 starts, seconds a pair"] and last.done == 1
 
 
 def test_the_papers_seconds_stand_beside_those_of_the_same_work():
-    measured = {"2": {BATCHED: {"median": 1.286}, LOOP: {"median": 9.0}}, "3": {BATCHED: {"median": 1.0}}}
-    section = Section("pair", (BATCHED, LOOP), [], measured, 1.0)
-    assert whole_pair.beside(section) == "The paper's on an RTX 6000 Ada: 12.86 s from 2 (here 0.1 of that)"
+    beside = whole_pair.beside({2: 1.286, 3: 1.0}, paper_seconds())
+    assert beside == "The paper's on an RTX 6000 Ada: 12.86 s from 2 (here 0.1 of that)"
 
 
 # ---------------------------------------------------------------- growth, precision
@@ -508,49 +500,42 @@ def test_exponents():
     [
         ({"pairs": [3]}, "pairs must list two or more"),
         ({"views": [3, 2]}, "views must"),
-        ({"starts": [0, 2]}, "starts"),
+        ({"starts": [2, 2]}, "starts"),
     ],
 )
 def test_sizes_that_give_no_exponent(settings, words):
     sizes = {"pairs": [1, 2], "starts": [1, 2], "views": [1, 2], **settings}
     with pytest.raises(UserError, match=words):
-        Scaling(CPU, None, None, **sizes, fixed={}, steps=1, rounds=1)
+        list(scaling.measure(None, None, **sizes, fixed={}, steps=1, rounds=1, device=CPU))
 
 
 @pytest.mark.parametrize(
-    ("words", "variant"),
+    ("words", "settings"),
     [
-        ("bfloat16", Variant("bfloat16")),
-        ("channels_last", Variant(channels_last=True)),
-        ("compile float16 channels_last", Variant("float16", True, True)),
-        ("cuda_graph bfloat16", Variant("bfloat16", recorded=True)),
+        ("bfloat16", {"dtype": "bfloat16"}),
+        ("channels_last", {"channels_last": True}),
+        ("compile float16 channels_last", {"dtype": "float16", "compile": True, "channels_last": True}),
+        ("cuda_graph bfloat16", {"dtype": "bfloat16", "cuda_graph": True}),
     ],
 )
-def test_variants_by_name(words, variant):
-    assert Variant.named(words) == variant
+def test_variants_by_name(words, settings):
+    assert variant(words, "narrow", 3) == Computing("narrow", max_batch=3, **settings)
 
 
 @pytest.mark.parametrize("words", ["", "bfloat8", "bfloat16 float16", "compile compile"])
 def test_variants_that_are_none(words):
     with pytest.raises(UserError, match=f"precision.variants: '{words}' is none; give one or more of float32, bfl"):
-        Variant.named(words)
-
-
-def test_variants_share_what_they_do_not_change():
-    measurement = Precision(CPU, "narrow", [], 1, 1, 1, None)
-    networks = Networks(second_stage.ARCHITECTURES["narrow"])
-    prior = measurement.prior(networks, Variant("bfloat16", channels_last=True))
-    assert prior.vae is networks.vae and prior.image_encoder is networks.image_encoder
-    assert prior.unet.dtype == torch.bfloat16 and networks.unet.dtype == torch.float32
+        variant(words, "narrow", None)
 
 
 def test_the_layout_leaves_the_gradient_and_reduced_precision_nearly():
-    *_, last = Precision(CPU, "narrow", ["channels_last", "bfloat16"], 2, 1, 1, None).measure()
-    assert list(last.record) == ["channels_last", "bfloat16"]
-    off = {words: entry["gradient_deviation"] for words, entry in last.record.items()}
-    assert off["channels_last"] < 1e-4 and 0 < off["bfloat16"] < 0.2
-    labels = [figure.label for figure in last.figures]
+    variants = ["channels_last", "bfloat16"]
+    *_, last = precision.measure("narrow", variants, starts=2, rounds=1, steps=1, max_batch=None, device=CPU)
+    off = {words: facts["gradient_deviation"] for words, facts in last.facts.items()}
+    assert list(off) == variants and off["channels_last"] < 1e-4 and 0 < off["bfloat16"] < 0.2
+    labels = [row.label for row in last.rows]
     assert labels == [f"{words}: {what}" for words in off for what in ("seconds a step", "share of peak")]
+    assert last.done == pytest.approx(1)
 
 
 # ---------------------------------------------------------------- the command
@@ -565,23 +550,24 @@ def test_the_command_measures_what_is_named(lp, tmp_path):
     assert ran.status == 0, ran.err
     kept = json.loads((tmp_path / "run" / "bench.json").read_text())
     assert list(kept) == ["second_stage", "device", "threads", "config", "versions"]
-    assert list(kept["second_stage"]["starts"]) == ["1", "2"]
+    rows = [f"{count}, {what}" for what in ("seconds a step", "share of peak") for count in ("1 start", "2 starts")]
+    assert list(kept["second_stage"]) == [*rows, "encoding_seconds", "arithmetic_per_start"]
     assert "2 starts, seconds a step" in ran.out and "results: run/bench.json" in ran.out
 
 
 def test_a_run_that_is_stopped_keeps_what_it_has(lp, tmp_path, monkeypatch):
-    run = SecondStage.run
+    solve = IFusion.solve
 
-    def stopped(self, runner, prior, steps):
-        if isinstance(runner, Batched) and runner.poses.shape[1] == 2:
+    def stopped(self, pairs, starts, seed):
+        if starts.shape[1] == 2:
             raise KeyboardInterrupt
-        return run(self, runner, prior, steps)
+        return solve(self, pairs, starts, seed)
 
-    monkeypatch.setattr(SecondStage, "run", stopped)
+    monkeypatch.setattr(IFusion, "solve", stopped)
     ran = lp("bench", *overrides(), "hydra.run.dir=run")
     assert ran.status == 130 and "1 start, seconds a step" in ran.out and "2 starts" not in ran.out
-    kept = json.loads((tmp_path / "run" / "bench.json").read_text())
-    assert list(kept["second_stage"]["starts"]) == ["1"] and kept["second_stage"]["starts"]["1"]["ratio"]
+    kept = json.loads((tmp_path / "run" / "bench.json").read_text())["second_stage"]
+    assert "2 starts, seconds a step" not in kept and kept["1 start, seconds a step"]["ratio"]
 
 
 def test_both_measurements_in_one_table(tmp_path):
@@ -591,10 +577,10 @@ def test_both_measurements_in_one_table(tmp_path):
     ran = commands.here("both", "bench", *settings, *tiny, "loader.rounds=1", "loader.steps=1")
     assert ran.status == 0, ran.err
     kept = ran.json("bench.json")
-    pairs = {name: kept["loader"][name] for name in (loader.FEATURE_SPACE, loader.PLAIN)}
-    for key, ratio in kept["loader"]["ratio"].items():
-        assert ratio == pytest.approx(pairs[loader.FEATURE_SPACE][key] / pairs[loader.PLAIN][key])
-    assert kept["loader"]["ratio"]["bytes_for_backward_per_pair"] < 1
+    for row in ("pairs a second", "memory for backward, kB a pair"):
+        one, other = (kept["loader"][row][name]["median"] for name in (loader.FEATURE_SPACE, loader.PLAIN))
+        assert kept["loader"][row]["ratio"] == pytest.approx(one / other)
+    assert kept["loader"]["memory for backward, kB a pair"]["ratio"] < 1
     assert ran.out.index("pairs a second") < ran.out.index("1 start, seconds a step")
     assert "loader: resnet18 at 32 px, 36 pairs a batch" in ran.out
 
@@ -607,19 +593,23 @@ def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
     assert ran.status == 0, ran.err
     kept = ran.json("bench.json")
     assert list(kept) == [*MEASUREMENTS, "device", "threads", "config", "versions"]
-    for name in ("encoding", "first_stage", "rendering"):
-        for entry in kept[name].values():
-            one, other = (each["median"] for each in entry.values() if isinstance(each, dict))
-            assert entry["ratio"] == pytest.approx(one / other)
-    assert list(kept["encoding"]) == ["backbone", "prior", "frozen_training"]
-    assert list(kept["first_stage"]) == ["1_pairs", "2_pairs"] and "raycast" in kept["rendering"]
-    assert list(kept["pair"]) == ["1", "2", "first_pair_seconds"] and "of that" not in ran.out  # 2 steps are not 50
-    assert list(kept["checkpoint"]) == ["float32", "bfloat16"]
-    assert kept["checkpoint"]["bfloat16"]["gigabytes"]["converted folder"] < 0.01
-    for entry in kept["adam_gauss_newton"].values():
-        assert entry["energy"]["equal"] <= entry["energy"]["start"] and len(entry["energies"]["Adam"]) == 4
-        assert entry["passes_per_start"]["Gauss-Newton"] == 8 * (entry["steps"]["Gauss-Newton"] + 1)
-        assert entry["passes_per_start"]["Adam"] == 2 * entry["steps"]["Adam"]
+    labels = {name: list(kept[name]) for name in MEASUREMENTS}
+    assert labels["encoding"] == [
+        f"pairs a second, {what}" for what in ("backbone", "prior", "training on a frozen backbone")
+    ]
+    assert labels["first_stage"] == ["1 pair, starts a second", "2 pairs of 2 images, starts a second"]
+    assert "raycast, views a second" in labels["rendering"]
+    assert labels["pair"] == ["1 start, seconds a pair", "2 starts, seconds a pair", "first_pair_seconds"]
+    assert "of that" not in ran.out  # 2 steps are not 50
+    disk = kept["checkpoint"]["bfloat16: GB on disk"]
+    assert disk["converted folder"]["median"] < 0.01 and disk["ratio"] < 1
+    assert "float32: seconds to load" in labels["checkpoint"]
+    for gamma in ("gamma 0", "gamma 0.3"):
+        facts = kept["adam_gauss_newton"][gamma]
+        assert facts["energy"]["equal"] <= facts["energy"]["start"] and len(facts["energies"]["Adam"]) == 4
+        passes = kept["adam_gauss_newton"][f"{gamma} before, to equal energy: passes a start"]
+        assert passes["Gauss-Newton"]["median"] == 8 * (facts["steps"]["Gauss-Newton"] + 1)
+        assert passes["Adam"]["median"] == 2 * facts["steps"]["Adam"]
     for name in ("pairs", "starts", "views"):
         sizes = kept["scaling"][name]["sizes"]
         assert list(sizes) == ["1", "2"] and sizes["2"]["peak_bytes"] > sizes["1"]["peak_bytes"] > 0
@@ -628,7 +618,9 @@ def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
 
 
 def test_the_table_gives_ratios_of_the_first_to_the_second():
-    section = Section("a", ("new", "old"), [Figure("seconds", 2.0, 8.0), Figure("pairs", 1809.4, 150.2)], {}, 1.0)
+    section = Section("a", ("new", "old"))
+    section.add("seconds", 2.0, 8.0)
+    section.add("pairs", 1809.4, 150.2)
     rows = list(zip(*(column.cells for column in table([section]).columns), strict=True))
     assert rows == [("a", "new", "old", "ratio"), ("seconds", "2", "8", "0.25 x"), ("pairs", "1809", "150", "12 x")]
 
@@ -638,38 +630,46 @@ def test_the_table_gives_ratios_of_the_first_to_the_second():
     [
         (
             "measure=[second_stag]",
-            "measure=second_stag is none of its values; did you mean 'second_stage'? (known: loa",
+            "measure=second_stag is none of the measurements; did you mean 'second_stage'? (known: loa",
         ),
         (
             "second_stage.architecture=narow",
-            "second_stage.architecture=narow is none of its values; did you mean 'narr",
+            "second_stage.architecture=narow does not fit; expected one of published, narrow; did you mean 'narrow'?",
         ),
-        ("second_stage.dtype=float64", "second_stage.dtype=float64 is none of its values; did you mean 'float16'?"),
-        ("second_stage.attention=fused", "second_stage.attention=fused is none of its values (known: sdpa, math)"),
-        ("second_stage.starts=[2,0]", "second_stage.starts must list numbers of starts, at least 1 each, got [2, 0]"),
-        ("measure=[pair] pair.starts=[]", "pair.starts must list numbers of starts, at least 1 each, got []"),
-        ("second_stage.starts=4", "second_stage.starts must list numbers of starts, at least 1 each, got 4"),
+        ("second_stage.dtype=float64", "second_stage.dtype=float64 does not fit; expected one of float32, bfloat16, "),
+        ("second_stage.attention=fused", "second_stage.attention=fused does not fit; expected one of sdpa, math"),
+        ("second_stage.starts=[2,0]", "second_stage.starts must be at least 1, got [2, 0]"),
+        ("measure=[pair] pair.starts=[]", "pair.starts must not be empty"),
+        ("second_stage.starts=4", "second_stage.starts=4 does not fit; expected Sequence[int]"),
         ("measure=[first_stage] first_stage.views=1", "first_stage.views must be at least 2, got 1"),
         (
             "measure=[rendering] rendering.object=duk",
-            "rendering.object=duk is none of its values; did you mean 'duck'?",
+            "rendering.object=duk is none of the embedded objects; did you mean 'duck'?",
         ),
         (
             "measure=[checkpoint] checkpoint.dtypes=[half]",
-            "checkpoint.dtypes=half is none of its values (known: float3",
+            "checkpoint.dtypes=['half'] does not fit; expected Sequence[",
         ),
         (
             "measure=[precision] precision.architecture=tiny",
-            "precision.architecture=tiny is none of its values (known: pu",
+            "precision.architecture=tiny does not fit; expected one of",
         ),
+        ("measure=[scaling] scaling.starts=[0,2]", "scaling.starts must be at least 1, got [0, 2]"),
         ("second_stage.rounds=0", "second_stage.rounds must be at least 1, got 0"),
-        ("second_stage.max_batch=0", "second_stage.max_batch must be at least 1 or null, got 0"),
-        ("accelerator=tpu", "accelerator=tpu is not available on this machine; choose auto or cpu"),
+        ("second_stage.max_batch=0", "second_stage.max_batch must be at least 1, got 0"),
+        ("accelerator=tpu", "accelerator=tpu is not available on this machine; choose auto"),
     ],
 )
 def test_mistakes(lp, setting, sentence):
     ran = lp("bench", *overrides(), *setting.split())
     assert ran.status == 1 and ran.error.startswith(sentence)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_what_wants_a_gpu_is_refused_without_one(lp, tmp_path):
+    ran = lp("bench", "experiment=gpu", "hydra.run.dir=run")
+    assert ran.status == 1 and ran.error.startswith("accelerator=cuda is not available on this machine")
+    assert not (tmp_path / "run" / "bench.json").exists()
 
 
 def test_a_missing_package_is_one_sentence(lp, monkeypatch):

@@ -1,1 +1,1 @@
-"""What `bench` measures, a module each: two contenders side by side in one run, alternated round by round."""
+"""What `bench` measures, a module each, with the one harness that times contenders side by side."""

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from lp_framework.benchmarks.contest import Match, Work, compete
-from lp_framework.benchmarks.section import Figure, Section
+from lp_framework.benchmarks.harness import Contest, Section, worth
+from lp_framework.benchmarks.second_stage import encoded
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairData
 from lp_framework.models.pose_model import PoseModel
-from lp_framework.priors.base import Prior, ViewCode
+from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution, pairs_of
 from lp_framework.solvers.gauss_newton import GaussNewton
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
+from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 
 NEWTON, ADAM = "Gauss-Newton", "Adam"
@@ -26,41 +27,6 @@ NEWTON, ADAM = "Gauss-Newton", "Adam"
 PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
 PROBE_NOISES = 2  # a timestep
 PROBE_SEED = 1  # the solvers' is 0
-
-Solve = Callable[[Pairs, Tensor, int], Solution]
-
-
-class Encoded(Prior):
-    """A prior whose images have been encoded: both contenders need their codes, so neither is charged for them."""
-
-    def __init__(self, prior: Prior, images: Tensor) -> None:
-        super().__init__()
-        self.prior, self.codes = prior, prior.encode(images)
-        self.num_timesteps, self.latent_shape, self.image_size = (
-            prior.num_timesteps, prior.latent_shape, prior.image_size,
-        )  # fmt: skip
-
-    def encode(self, images: Tensor) -> ViewCode:
-        return self.codes
-
-    def residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
-        return self.prior.residual(target, source, pose, timestep, noise)
-
-    def denoising_error(
-        self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor
-    ) -> Tensor:
-        return self.prior.denoising_error(target, source, pose, timestep, noise)
-
-    def generate(
-        self,
-        source: ViewCode,
-        pose: Tensor,
-        steps: int = 50,
-        guidance: float = 3.0,
-        generator: torch.Generator | None = None,
-        eta: float = 1.0,
-    ) -> Tensor:
-        return self.prior.generate(source, pose, steps, guidance, generator, eta)
 
 
 @dataclass(frozen=True)
@@ -84,50 +50,55 @@ def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
 
 
 def measure(
-    pairs: Pairs,
-    starts: Tensor,
+    data: PairDataModule,
     model: PoseModel,
     prior: Prior,
+    names: Mapping[str, str],
+    pairs: int,
+    starts: int,
     gammas: Sequence[float],
     newton_steps: int,
     adam_steps: int,
     rounds: int,
     device: torch.device,
-    note: str = "",
 ) -> Iterator[Section]:
-    """Descents from where the first stage ends under each of `gammas`, the noise of its longitudes.
+    """Descents on `pairs` of the test views from where the first stage ends under each of `gammas`.
 
-    Equal energy is the lowest that both reach. Seconds are those of a whole descent, by the share of its passes.
+    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach. Seconds are those
+    of a whole descent, by the share of its passes.
     """
-    model, encoded = model.to(device), Encoded(prior.to(device), pairs.images)
-    newton = GaussNewton(model, encoded, refinement_steps=newton_steps, trajectory=True)
-    adam = TwoStage(model, encoded, refinement_steps=adam_steps, trajectory=True).second
-    solve = {NEWTON: newton.refine, ADAM: adam.solve}
-    looks = {NEWTON: 1, ADAM: 0}  # passes at the start itself, in steps
-    figures: list[Figure] = []
-    records: dict[str, Any] = {}
-    matches = []
+    model, prior, chosen = model.to(device), prior.to(device), some_pairs(data.data("test"), pairs, device)
+    ready = encoded(prior, prior.encode(chosen.images))
+    newton = GaussNewton(model, ready, refinement_steps=newton_steps, trajectory=True)
+    adam = TwoStage(model, ready, refinement_steps=adam_steps, trajectory=True).second
+    section = Section("second stage: Gauss-Newton and Adam", (NEWTON, ADAM))
+    section.note = f"{len(chosen)} pairs of {names['data']}'s test views, {starts} starts, prior={names['prior']}"
+    contests = []
     for gamma in gammas:
-        ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(pairs, starts, seed=0).poses
-        descents = {name: followed(encoded, pairs, solve[name](pairs, ends, 0), looks[name]) for name in (NEWTON, ADAM)}
+        poses = Ring(starts).make(chosen, seed=0)
+        ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(chosen, poses, seed=0).poses
+        descents = {
+            NEWTON: followed(ready, chosen, newton.refine(chosen, ends, 0), looks=1),
+            ADAM: followed(ready, chosen, adam.solve(chosen, ends, 0), looks=0),
+        }
         level = max(min(descent.energies) for descent in descents.values())
         steps = {name: descent.reached(level) for name, descent in descents.items()}
-        passes = {name: descents[name].passes[steps[name]] for name in descents}
-        shares = {name: passes[name] / descents[name].passes[-1] for name in descents}
-        key, label = f"gamma_{gamma:g}", f"gamma {gamma:g} before, to equal energy"
-        figures.append(Figure(f"{label}: passes a start", passes[NEWTON], passes[ADAM]))
-        records[key] = {
+        passes = [descent.passes[steps[name]] for name, descent in descents.items()]
+        shares = [its / descent.passes[-1] for its, descent in zip(passes, descents.values(), strict=True)]
+        label = f"gamma {gamma:g} before, to equal energy"
+        section.add(f"{label}: passes a start", *passes)
+        section.facts[f"gamma {gamma:g}"] = {
             "energy": {"start": descents[ADAM].energies[0], "equal": level},
             "steps": steps,
-            "passes_per_start": {**passes, "ratio": figures[-1].ratio},
             "energies": {name: list(descent.energies) for name, descent in descents.items()},
         }
-        first, second = (_work(solve[name], pairs, ends, shares[name]) for name in (NEWTON, ADAM))
-        matches.append(Match(key, f"{label}: seconds a 1000 starts", first, second, rate=False))
-    title = "second stage: Gauss-Newton and Adam"
-    for section in compete(title, (NEWTON, ADAM), matches, rounds, device, note):
-        record = {key: {**records[key], "seconds_per_1000_starts": seconds} for key, seconds in section.record.items()}
-        yield replace(section, figures=[*figures, *section.figures], record=record)
+        # A whole descent is worth more starts than it has where a share of it is enough.
+        first, second = (
+            worth(len(chosen) * starts / 1000 / share, partial(solve, chosen, ends, 0))
+            for solve, share in zip((newton.refine, adam.solve), shares, strict=True)
+        )
+        contests.append(Contest(f"{label}: seconds a 1000 starts", first, second))
+    return section.race(contests, rounds, device)
 
 
 def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> Descent:
@@ -142,13 +113,3 @@ def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> Desc
     steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
     passes = (solution.cost.network_passes - len(pairs.images)) / starts  # the images have been encoded before
     return Descent(energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)])
-
-
-def _work(solve: Solve, pairs: Pairs, starts: Tensor, share: float) -> Work:
-    """A whole descent, worth more starts than it has, because a `share` of it is enough."""
-
-    def work() -> float:
-        solve(pairs, starts, 0)
-        return starts.shape[0] * starts.shape[1] / 1000 / share
-
-    return work

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -10,59 +9,26 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from lp_framework.clock import now
+from lp_framework.benchmarks.harness import timed
 
-# Dense tensor-core rates by NVIDIA's data sheets, TFLOP/s: of bfloat16 and float16, and of TF32, in which PyTorch lets
-# cuDNN convolve float32 unless told otherwise. The first name that is found in the device's counts.
-PEAKS = (
-    (r"H200 NVL|H100 NVL", 835, 418),
-    (r"H100 PCIe", 756, 378),
-    (r"H100|H200|GH200", 989, 495),
-    (r"\bA100\b", 312, 156),
-    (r"L40S", 362, 183),
-    (r"\bL4\b", 121, 60),
-    (r"RTX 6000 Ada", 364, 182),
-    (r"RTX 4090", 165, 83),
-    (r"RTX A6000", 155, 77),
-    (r"RTX 3090\b", 71, 36),
-)
 MATMUL_SIDE = {"cpu": 1024, "cuda": 8192}
 REPEATS = 5
 
 
-class Peak(NamedTuple):
-    """Operations a second of a device in some dtype, and where the number is from."""
-
-    rate: float
-    source: str
-
-    def __str__(self) -> str:
-        return f"{self.rate / 1e12:.3g} TFLOP/s ({self.source})"
-
-
 class Arithmetic(NamedTuple):
-    """The operations of a piece of work, what the device could do, and the launches where they were counted."""
+    """The operations of a piece of work, and how many a second the device can do: those of a matrix product."""
 
     operations: int
-    peak: Peak
-    launches: int | None = None
+    peak: float
+    launches: int | None = None  # where they were counted
 
     def share(self, seconds: float) -> float:
         """The share of the device's peak that is reached when the work takes so long."""
-        return self.operations / seconds / self.peak.rate
-
-    def record(self) -> dict[str, float | str]:
-        """For the JSON file."""
-        return {
-            "operations": self.operations,
-            **({} if self.launches is None else {"launches": self.launches}),
-            "peak_operations_per_second": self.peak.rate,
-            "peak_source": self.peak.source,
-        }
+        return self.operations / seconds / self.peak
 
     def __str__(self) -> str:
         launches = "" if self.launches is None else f" in {self.launches:,} launches"
-        return f"{self.operations / 1e9:.3g} GFLOP{launches}, the device's peak {self.peak}"
+        return f"{self.operations / 1e9:.3g} GFLOP{launches}, the device's peak {self.peak / 1e12:.3g} TFLOP/s"
 
 
 def counted(work: Callable[[], object]) -> int:
@@ -99,24 +65,9 @@ class _Launches(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-def peak(device: torch.device, dtype: torch.dtype) -> Peak:
-    """The data sheet's rate of a GPU that is known here, else the rate of a matrix product on the device."""
-    if device.type == "cuda":
-        name = torch.cuda.get_device_name(device)
-        for pattern, half, single in PEAKS:
-            if re.search(pattern, name):
-                return Peak(1e12 * (single if dtype == torch.float32 else half), "data sheet")
-    return Peak(matmul_rate(device, dtype), "matrix product")
-
-
-def matmul_rate(device: torch.device, dtype: torch.dtype) -> float:
+def peak_rate(device: torch.device, dtype: torch.dtype) -> float:
     """Operations a second of the fastest of a few products of square matrices."""
     side = MATMUL_SIDE["cuda" if device.type == "cuda" else "cpu"]
     matrix = torch.randn(side, side, device=device).to(dtype)
     matrix @ matrix
-    seconds = []
-    for _ in range(REPEATS):
-        began = now(device)
-        matrix @ matrix
-        seconds.append(now(device) - began)
-    return 2 * side**3 / min(seconds)
+    return 2 * side**3 / min(timed(lambda: matrix @ matrix, device)[0] for _ in range(REPEATS))

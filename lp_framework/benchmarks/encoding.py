@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 
-from lp_framework.benchmarks.contest import Match, Work, compete
-from lp_framework.benchmarks.loader import feature_space, plain_pairs
-from lp_framework.benchmarks.section import Section
-from lp_framework.data.pairs import PairBatch, PairData
+from lp_framework.benchmarks.harness import Contest, Section, Work
+from lp_framework.benchmarks.loader import feature_space, loss_on, plain_pairs, told
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.pairs import PairBatch
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 
@@ -19,85 +19,57 @@ ONCE, PLAIN = "each view once", "two images a pair"
 
 
 def measure(
-    views: PairData,
-    model: PoseModel,
+    data: PairDataModule,
+    new_model: PoseModel,
     prior: Prior,
-    batch_pairs: int,
-    block: int,
+    names: Mapping[str, str],
     rounds: int,
     device: torch.device,
-    note: str = "",
 ) -> Iterator[Section]:
     """Pairs a second through the model's backbone, through the prior's encoder, and in training on a frozen backbone.
 
     The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
     against features of both images of every pair at every step. Batches are drawn beforehand.
     """
-    model, prior = model.to(device), prior.to(device)
-    once, plain = next(feature_space(views, batch_pairs, block)), next(plain_pairs(views, batch_pairs))
-    kept = trunk_features(model, images_of(once, device))
-    matches = [
-        Match(
-            "backbone",
-            "pairs a second, backbone",
-            encoding(model.encode, once, device),
-            encoding(model.encode, plain, device),
-        ),
-        Match(
-            "prior",
-            "pairs a second, prior",
-            encoding(prior.encode, once, device),
-            encoding(prior.encode, plain, device),
-        ),
-        Match(
-            "frozen_training",
-            "pairs a second, training on a frozen backbone",
-            training(model, once, lambda: kept),
-            training(model, plain, lambda: trunk_features(model, images_of(plain, device))),
-        ),
+    views, model, prior = data.data("train"), new_model.to(device), prior.to(device)
+    once = next(feature_space(views, data.batch_pairs, data.block))
+    plain = next(plain_pairs(views, data.batch_pairs))
+    optimizer = torch.optim.Adam(  # the weights stay, so every step does the same work
+        [*model.backbone.head.parameters(), *model.network.parameters()], lr=0.0
+    )
+
+    def images(batch: PairBatch) -> Tensor:
+        return move_data_to_device(batch, device).images
+
+    def encoding(encode: Callable[[Tensor], object], batch: PairBatch) -> Work:
+        def work() -> float:
+            with torch.no_grad():
+                encode(images(batch))
+            return len(batch)
+
+        return work
+
+    def training(batch: PairBatch, trunk: Callable[[], Tensor]) -> Work:
+        def work() -> float:
+            optimizer.zero_grad()
+            loss_on(model, batch, device, model.backbone.head(trunk())).backward()
+            optimizer.step()
+            return len(batch)
+
+        return work
+
+    kept = trunk_features(model, images(once))
+    contests = [
+        Contest(f"pairs a second, {name}", encoding(encode, once), encoding(encode, plain), rate=True)
+        for name, encode in (("backbone", model.encode), ("prior", prior.encode))
     ]
-    return compete("encoding: the images of pairs", (ONCE, PLAIN), matches, rounds, device, note)
-
-
-def images_of(batch: PairBatch, device: torch.device) -> Tensor:
-    """The images of a batch, `[I, 3, H, W]`."""
-    return move_data_to_device(batch, device).images
+    frozen = training(once, lambda: kept), training(plain, lambda: trunk_features(model, images(plain)))
+    contests.append(Contest("pairs a second, training on a frozen backbone", *frozen, rate=True))
+    note = f"{told(data, model, names)}; prior={names['prior']}"
+    return Section("encoding: the images of pairs", (ONCE, PLAIN), note).race(contests, rounds, device)
 
 
 @torch.no_grad()
 def trunk_features(model: PoseModel, images: Tensor) -> Tensor:
-    """`[I, trunk_dim]`, without a graph, as of a frozen trunk."""
+    """`[I, trunk_dim]` of images `[I, 3, H, W]`, without a graph, as of a frozen trunk."""
     return model.backbone.trunk(images)
-
-
-def encoding(encode: Callable[[Tensor], object], batch: PairBatch, device: torch.device) -> Work:
-    """Encodes a batch's images, which serve its pairs."""
-
-    def work() -> float:
-        with torch.no_grad():
-            encode(images_of(batch, device))
-        return len(batch)
-
-    return work
-
-
-def training(model: PoseModel, batch: PairBatch, features: Callable[[], Tensor]) -> Work:
-    """A step of head and network on a batch whose trunk features `[I, trunk_dim]` are asked for."""
-    parameters = [*model.backbone.head.parameters(), *model.network.parameters()]
-    optimizer = torch.optim.Adam(parameters, lr=0.0)  # the weights stay, so every step does the same work
-
-    def work() -> float:
-        optimizer.zero_grad()
-        loss_on(model, batch, features()).backward()
-        optimizer.step()
-        return len(batch)
-
-    return work
-
-
-def loss_on(model: PoseModel, batch: PairBatch, features: Tensor) -> Tensor:
-    """The objective of a batch on its trunk features `[I, trunk_dim]`."""
-    views = model.backbone.head(features)
-    true = batch.relative_poses().to(features)
-    condition = model.condition(views[batch.reference.to(features.device)], views[batch.query.to(features.device)])
-    return model.pair_loss(condition, torch.zeros_like(true), true).mean()

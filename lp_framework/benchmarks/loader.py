@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from statistics import median
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from itertools import chain
+from typing import Any
 
 import numpy as np
 import torch
 from lightning.fabric.utilities import move_data_to_device
+from torch import Tensor
 
-from lp_framework.benchmarks.section import Figure, Section
-from lp_framework.clock import now
+from lp_framework.benchmarks.harness import Contest, Section, Work
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData
 from lp_framework.models.pose_model import PoseModel
 
@@ -18,47 +21,41 @@ FEATURE_SPACE, PLAIN = "pairs in feature space", "plain pair loader"
 
 
 def measure(
-    views: PairData,
-    model: PoseModel,
-    batch_pairs: int,
-    block: int,
+    data: PairDataModule,
+    new_model: PoseModel,
+    names: Mapping[str, str],
     rounds: int,
     steps: int,
     device: torch.device,
-    note: str = "",
 ) -> Iterator[Section]:
-    """Time training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
-    model = model.to(device)
-    contenders = {FEATURE_SPACE: feature_space(views, batch_pairs, block), PLAIN: plain_pairs(views, batch_pairs)}
+    """Training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
+    views, model = data.data("train"), new_model.to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0)  # the weights stay, so every step does the same work
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    kept: dict[str, float] = {}
-    for name, batches in contenders.items():  # warm-up, and the memory
-        storage, pairs = kept_for_backward(model, next(batches), device)
-        kept[name] = storage / pairs
-    for number in range(rounds):
-        for name, batches in contenders.items():
-            began = now(device)
+
+    def training(batches: Iterator[PairBatch]) -> Work:
+        def work() -> float:
             done = 0
             for _ in range(steps):
                 batch = next(batches)
-                _step(model, optimizer, batch, device)
+                optimizer.zero_grad()
+                loss_on(model, batch, device).backward()
+                optimizer.step()
                 done += len(batch)
-            seconds[name].append((now(device) - began) / done)
-        yield _section(seconds, kept, (number + 1) / rounds, note)
+            return done
+
+        return work
+
+    loaders = feature_space(views, data.batch_pairs, data.block), plain_pairs(views, data.batch_pairs)
+    section = Section("loader: a training step", (FEATURE_SPACE, PLAIN), told(data, model, names))
+    kept = [kept_for_backward(model, next(batches), device) for batches in loaders]  # and a warm-up
+    section.add("memory for backward, kB a pair", kept[0] / 1024, kept[1] / 1024)
+    contest = Contest("pairs a second", training(loaders[0]), training(loaders[1]), rate=True)
+    return section.race([contest], rounds, device, warm_up=False)
 
 
-def _section(seconds: dict[str, list[float]], kept: dict[str, float], done: float, note: str) -> Section:
-    rates = {name: 1 / median(values) for name, values in seconds.items()}
-    record: dict[str, dict[str, float]] = {
-        name: {"pairs_per_second": rates[name], "bytes_for_backward_per_pair": kept[name]} for name in seconds
-    }
-    record["ratio"] = {key: value / record[PLAIN][key] for key, value in record[FEATURE_SPACE].items()}
-    figures = [
-        Figure("pairs a second", rates[FEATURE_SPACE], rates[PLAIN]),
-        Figure("memory for backward, kB a pair", kept[FEATURE_SPACE] / 1024, kept[PLAIN] / 1024),
-    ]
-    return Section("loader: a training step", (FEATURE_SPACE, PLAIN), figures, record, done, note)
+def told(data: PairDataModule, model: PoseModel, names: Mapping[str, str]) -> str:
+    """The model's backbone and the size of a batch."""
+    return f"{names['backbone']} at {model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
 
 
 def feature_space(data: PairData, batch_pairs: int, block: int) -> Iterator[PairBatch]:
@@ -75,46 +72,45 @@ def plain_pairs(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
     random = np.random.default_rng(0)
     while True:
         drawn = everything[random.choice(len(everything), batch_pairs, replace=False)]
-        singles = [data[pair[None]] for pair in drawn]
-        offsets = 2 * torch.arange(batch_pairs)
-        yield PairBatch(
-            pixels=torch.cat([single.pixels for single in singles if single.pixels is not None]),
-            features=None,
-            poses=torch.cat([single.poses for single in singles]),
-            cameras=torch.cat([single.cameras for single in singles]),
-            objects=torch.cat([single.objects for single in singles]),
-            reference=torch.cat([single.reference for single in singles]) + offsets,
-            query=torch.cat([single.query for single in singles]) + offsets,
-            pairs=torch.cat([single.pairs for single in singles]),
-        )
+        yield side_by_side([data[pair[None]] for pair in drawn])
 
 
-def _loss(model: PoseModel, batch: PairBatch, device: torch.device) -> torch.Tensor:
+def side_by_side(batches: list[PairBatch]) -> PairBatch:
+    """One batch of several pairs, each with two images of its own."""
+    joined: dict[str, Any] = {}
+    for name in (field.name for field in fields(PairBatch)):
+        parts = [getattr(batch, name) for batch in batches]
+        if isinstance(parts[0], Tensor):
+            joined[name] = torch.cat(parts)
+        else:
+            joined[name] = None if parts[0] is None else list(chain(*parts))
+    whole = PairBatch(**joined)
+    offsets = 2 * torch.arange(len(batches))
+    return replace(whole, reference=whole.reference + offsets, query=whole.query + offsets)
+
+
+def loss_on(model: PoseModel, batch: PairBatch, device: torch.device, features: Tensor | None = None) -> Tensor:
+    """The objective of a batch, of its images or of its views' features `[I, D]` where these are given."""
     batch = move_data_to_device(batch, device)
-    features = model.encode(batch.images)
+    if features is None:
+        features = model.encode(batch.images)
     true = batch.relative_poses()
     condition = model.condition(features[batch.reference], features[batch.query])
     return model.pair_loss(condition, torch.zeros_like(true), true).mean()
 
 
-def _step(model: PoseModel, optimizer: torch.optim.Optimizer, batch: PairBatch, device: torch.device) -> None:
-    optimizer.zero_grad()
-    _loss(model, batch, device).backward()
-    optimizer.step()
-
-
-def kept_for_backward(model: PoseModel, batch: PairBatch, device: torch.device) -> tuple[float, int]:
-    """Bytes of the activations that a step keeps for its backward pass, and the batch's number of pairs."""
+def kept_for_backward(model: PoseModel, batch: PairBatch, device: torch.device) -> float:
+    """Bytes a pair of the activations that a step keeps for its backward pass."""
     storages: dict[int, int] = {}
     parameters = {parameter.data_ptr() for parameter in model.parameters()}
 
-    def count(tensor: torch.Tensor) -> torch.Tensor:
+    def count(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
         if storage.data_ptr() not in parameters:
             storages[storage.data_ptr()] = storage.nbytes()
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-        loss = _loss(model, batch, device)
+        loss = loss_on(model, batch, device)
     loss.backward()
-    return float(sum(storages.values())), len(batch)
+    return sum(storages.values()) / len(batch)

@@ -2,90 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
-from lp_framework.benchmarks.contest import Match, Work, compete, timed
+import torch
+
+from lp_framework.benchmarks.harness import Contest, Section, timed, worth
 from lp_framework.benchmarks.second_stage import (
     BATCHED,
     LOOP,
+    Computing,
     PlainLoop,
-    SecondStage,
-    check_counts,
-    halved,
+    looped,
+    plain_prior,
     random_pair,
+    told,
 )
-from lp_framework.benchmarks.section import Section
 from lp_framework.models.pose_model import PoseModel
-from lp_framework.report.paper import paper_table
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 
 PAPER_STEPS = 50  # of the paper's second stage
 
 
-def measure(stage: SecondStage, model: PoseModel, starts: Sequence[int], steps: int, rounds: int) -> Iterator[Section]:
-    """The section after every pair.
+def measure(
+    computing: Computing,
+    model: PoseModel,
+    paper_seconds: Mapping[int, float],
+    starts: Sequence[int],
+    steps: int,
+    rounds: int,
+    device: torch.device,
+) -> Iterator[Section]:
+    """`two_stage` with `steps` steps of its second stage against the second stage alone by `PlainLoop`.
 
-    The first contender is `two_stage` with `steps` steps of its second stage, images encoded for each pair, computing
-    as `stage` says; the second the second stage alone, by `PlainLoop`. The first pair of a number of starts, in which
-    kernels are chosen, compiled or recorded, is told apart.
+    The first computes as `computing` says and encodes the images of each pair. The first pair of a number of starts, in
+    which kernels are chosen, compiled or recorded, is told apart. `paper_seconds` are the paper's by number of starts.
     """
-    check_counts("pair.starts", starts)
-    batch_prior, loop_prior = stage.priors()
-    solver = TwoStage(model.to(stage.device), batch_prior, refinement_steps=steps)
-    pair = random_pair(stage.device)
-    ring = {count: Ring(count).make(pair, seed=0).to(stage.device) for count in starts}
+    networks, pair = computing.networks(device), random_pair(device)
+    batch_prior, loop_prior = computing.prior(networks), plain_prior(networks)
+    solver = TwoStage(model.to(device), batch_prior, refinement_steps=steps)
+    ring = {count: Ring(count).make(pair, seed=0) for count in starts}
 
-    def ours(count: int) -> Work:
-        def work() -> float:
-            solver.solve(pair, ring[count], seed=0)
-            return 1
+    def plain(count: int) -> None:
+        looped([PlainLoop(loop_prior, pair.images, start) for start in ring[count][0]], steps)()
 
-        return work
-
-    def plain(count: int) -> Work:
-        def work() -> float:
-            for start in ring[count][0]:
-                loop = PlainLoop(loop_prior, pair.images, start)
-                for _ in range(steps):
-                    loop.step()
-            return 1
-
-        return work
-
-    first = {str(count): timed(ours(count), stage.device)[0] for count in starts}
+    ours = {count: worth(1, partial(solver.solve, pair, poses, 0)) for count, poses in ring.items()}
+    first = {count: timed(work, device)[0] for count, work in ours.items()}
     PlainLoop(loop_prior, pair.images, ring[starts[0]][0, 0]).step()
-    matches = [
-        Match(str(count), f"{count} start{'s' if count > 1 else ''}, seconds a pair", ours(count), plain(count), False)
-        for count in starts
-    ]
-    note = (
-        f"Zero123's {stage.architecture} size, random weights. {BATCHED}: two_stage with {steps} steps of its second "
-        f"stage; {LOOP}: as many of each start, images anew each step. "
+    section = Section("pair: both stages and encoding", (BATCHED, LOOP), facts={"first_pair_seconds": first})
+    section.note = (
+        f"Zero123's {computing.architecture} size, random weights. {BATCHED}: two_stage with {steps} steps of its "
+        f"second stage{computing.halved(batch_prior)}; {LOOP}: as many of each start, images anew each step. "
         f"The first pair took {', '.join(f'{seconds:.3g} s from {count}' for count, seconds in first.items())}. "
     )
-    title = "pair: both stages and encoding"
-    for section in compete(title, (BATCHED, LOOP), matches, rounds, stage.device, note, warm_up=False):
-        few = halved(batch_prior, stage.max_batch)
-        papers = beside(section) if stage.architecture == "published" and steps == PAPER_STEPS else ""
-        yield replace(section, record={**section.record, "first_pair_seconds": first}, note=note + papers + few)
-
-
-def beside(section: Section) -> str:
-    """The paper's seconds, from those numbers of starts that have been measured and that it has."""
-    paper = paper_seconds()
-    told = [
-        f"{paper[key]} s from {key} (here {entry[BATCHED]['median'] / paper[key]:.2g} of that)"
-        for key, entry in section.record.items()
-        if key in paper
+    contests = [
+        Contest(f"{told(count)}, seconds a pair", work, worth(1, partial(plain, count))) for count, work in ours.items()
     ]
-    return f"The paper's on an RTX 6000 Ada: {', '.join(told)}" if told else ""
+    yield from section.race(contests, rounds, device, warm_up=False)
+    if computing.architecture == "published" and steps == PAPER_STEPS:
+        medians = [row.medians[0] for row in section.rows]
+        section.note += beside(dict(zip(starts, medians, strict=True)), paper_seconds)
+    yield section
 
 
-def paper_seconds() -> dict[str, float]:
-    """The paper's seconds a pair by the number of starts (appendix, Analysis of Inference Time)."""
-    table = paper_table("starts")
-    assert table is not None  # it is in this package
-    rows = [row for row in table.rows if row.settings["solver.name"] == "two_stage"]
-    return {str(row.settings["start.count"]): row.metrics["seconds_per_pair"] for row in rows}
+def beside(seconds: Mapping[int, float], paper: Mapping[int, float]) -> str:
+    """The paper's seconds by the number of starts, for those numbers that have been measured and that it has."""
+    found = [
+        f"{paper[count]} s from {count} (here {seconds[count] / paper[count]:.2g} of that)"
+        for count in seconds
+        if count in paper
+    ]
+    return f"The paper's on an RTX 6000 Ada: {', '.join(found)}" if found else ""

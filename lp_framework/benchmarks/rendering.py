@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.benchmarks.contest import Match, Work, compete
-from lp_framework.benchmarks.section import Section
-from lp_framework.data.meshes import MeshObject, load_scene
+from lp_framework.benchmarks.harness import Contest, Section, worth
+from lp_framework.data.meshes import load_scene
 from lp_framework.data.rendering.renderer import Renderer
-from lp_framework.errors import UserError
+from lp_framework.data.toy import toy_objects
+from lp_framework.errors import UserError, nearest
 from lp_framework.geometry import camera_to_world
 
 ONCE, LOOP = "mesh loaded once", "for every view"
@@ -24,28 +25,33 @@ FIELD_OF_VIEW_DEGREES = 49.1
 
 
 def measure(
-    obj: MeshObject, renderers: Mapping[str, Renderer], views: int, resolution: int, rounds: int, device: torch.device
+    object: str, renderers: Mapping[str, Renderer], views: int, resolution: int, rounds: int, device: torch.device
 ) -> Iterator[Section]:
-    """Views of an object around it, from a mesh file (GLB); renderers that cannot work here are named in the note."""
-    cameras = around(views)
+    """Views around an embedded object, from a mesh file (GLB); renderers that cannot work are named in the note."""
+    objects = {each.name: each for each in toy_objects()}
+    if object not in objects:
+        known = f"{nearest(object, objects)} (known: {', '.join(objects)})"
+        raise UserError(f"rendering.object={object} is none of the embedded objects{known}")
+    mesh = objects[object].load()
+    cameras, contests, missing = around(views), [], []
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"{obj.name}.glb"
-        obj.load().export(file)
-        matches, missing = [], []
+        file = Path(folder) / f"{object}.glb"
+        mesh.export(file)
         for name, renderer in renderers.items():
             try:
-                renderer.render(obj.load(), cameras[:1], 8, FIELD_OF_VIEW_DEGREES)
+                renderer.render(mesh, cameras[:1], 8, FIELD_OF_VIEW_DEGREES)
             except UserError as error:
                 missing.append(str(error))
                 continue
             once, each_time = (
-                _work(draw, renderer, file, cameras, resolution) for draw in (views_once, views_each_time)
+                worth(views, partial(draw, renderer, file, cameras, resolution))
+                for draw in (views_once, views_each_time)
             )
-            matches.append(Match(name, f"{name}, views a second", once, each_time))
-        if not matches:
+            contests.append(Contest(f"{name}, views a second", once, each_time, rate=True))
+        if not contests:
             raise UserError(f"there is nothing to render with here: {'; '.join(missing)}")
-        note = "; ".join([f"{obj.name}, {views} views of {resolution} x {resolution} pixels", *missing])
-        yield from compete("rendering: views of a mesh file", (ONCE, LOOP), matches, rounds, device, note)
+        note = "; ".join([f"{object}, {views} views of {resolution} x {resolution} pixels", *missing])
+        yield from Section("rendering: views of a mesh file", (ONCE, LOOP), note).race(contests, rounds, device)
 
 
 def around(views: int) -> Tensor:
@@ -62,15 +68,4 @@ def views_once(renderer: Renderer, file: Path, cameras: Tensor, resolution: int)
 
 def views_each_time(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
     """The same as a plain loop, which loads the file for every view."""
-    views = [renderer.render(load_scene(file), each[None], resolution, FIELD_OF_VIEW_DEGREES) for each in cameras]
-    return np.concatenate(views)
-
-
-def _work(
-    draw: Callable[[Renderer, Path, Tensor, int], NDArray[np.uint8]],
-    renderer: Renderer,
-    file: Path,
-    cameras: Tensor,
-    resolution: int,
-) -> Work:
-    return lambda: len(draw(renderer, file, cameras, resolution))
+    return np.concatenate([views_once(renderer, file, each[None], resolution) for each in cameras])
