@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from lp_framework.evaluation.landscape import Landscape, landscape_grid
+from lp_framework.analysis.landscapes import Landscape, landscape_grid
 
 
 def wells(*places: tuple[float, float, float], width: float = 4.0, **grid: float) -> Landscape:

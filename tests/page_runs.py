@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 from result_folders import metrics, write_job, write_result
 
-from lp_framework.evaluation.examples import EXAMPLES, Example, View, save_examples
-from lp_framework.evaluation.landscape import Landscape, landscape_grid
+from lp_framework.analysis.examples import EXAMPLES, save_examples
+from lp_framework.analysis.landscapes import Landscape, landscape_grid
+from lp_framework.analysis.shown import ShownPair, View
 from lp_framework.evaluation.tables import PAIR_COLUMNS
 
 NASTY = "</script><img src=x onerror=alert(1)>&_$cup"
@@ -22,7 +23,9 @@ ERRORS = {NASTY: 170.0, "red_mug": 3.0, "vase": 80.0}
 STEPS, STARTS = 20, 4
 
 
-def example(name: str = "red_mug", error: float = 3.0, reason: str = "worst of 4 pairs", steps: int = STEPS) -> Example:
+def example(
+    name: str = "red_mug", error: float = 3.0, reason: str = "worst of 4 pairs", steps: int = STEPS
+) -> ShownPair:
     """Four starts on straight ways to the answer, `error` degrees of longitude from the truth, over two valleys."""
     latitude, longitude = landscape_grid()
     truth = np.array([0.3, 2.0, 0.1])
@@ -32,9 +35,9 @@ def example(name: str = "red_mug", error: float = 3.0, reason: str = "worst of 4
     ends = np.repeat(truth[None] + [0.0, math.radians(error), 0.0], STARTS, axis=0)
     share = np.linspace(0, 1, steps + 1)[None, :, None]
     shade = np.random.default_rng(0).integers(0, 255, (24, 24, 3), dtype=np.uint8)
-    return Example(
-        name, OBJECTS.get(name, "unique"), reason, View("000.png", shade, np.array([0.1, 1.0, 1.4])),
-        View("001.png", shade[::-1].copy(), np.array([0.4, 3.0, 1.5])), truth, starts,
+    return ShownPair(
+        name, OBJECTS.get(name, "unique"), reason, View(Path("000.png"), shade, np.array([0.1, 1.0, 1.4])),
+        View(Path("001.png"), shade[::-1].copy(), np.array([0.4, 3.0, 1.5])), truth, starts,
         (1 - share) * starts[:, None] + share * ends[:, None], ends, np.array([2.0, 1.0, 3.0, np.nan]), chosen=1,
         rotation_errors=np.full(STARTS, error), translation_errors=np.full(STARTS, 0.1),
         landscapes={"energy of the prior": Landscape(latitude, longitude, 0.1, energy),

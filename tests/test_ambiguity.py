@@ -8,8 +8,9 @@ import pytest
 import torch
 from exact_prior import ExactPrior, image_of
 
-from lp_framework.evaluation.ambiguity import Ambiguity, ambiguity
-from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
+from lp_framework.analysis.ambiguity import Ambiguity, ambiguity
+from lp_framework.analysis.fields import Draws, prior_landscapes
+from lp_framework.analysis.landscapes import Landscape, landscape_grid
 from lp_framework.priors.base import ViewCode
 from lp_framework.solvers.base import Pairs
 
@@ -33,9 +34,8 @@ def score(prior: ExactPrior, count: int = 6) -> Ambiguity:
     views = torch.rand(2 * count, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.8, 6.0, 0.5])
     pairs = Pairs(image_of(views), torch.arange(count), torch.arange(count, 2 * count), torch.arange(count))
     truth = views[count:] - views[:count]
-    grid = landscape_grid()
-    energies = prior_landscapes(prior, pairs, truth[:, 2], *grid, timesteps=[500], noises=1, seed=0)
-    return ambiguity([Landscape(*grid, 0.0, energy) for energy in energies], truth[:, 1] % (2 * math.pi))
+    landscapes = prior_landscapes(prior, pairs, truth[:, 2], landscape_grid(), Draws([500], 1, seed=0))
+    return ambiguity(landscapes, truth[:, 1] % (2 * math.pi))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from exact_prior import ExactPrior, image_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lp_framework.evaluation.azimuth import Profile, azimuth_energies, profile, within
+from lp_framework.analysis.azimuth import Profile, azimuth_energies, profile, within
+from lp_framework.analysis.fields import Draws
 from lp_framework.solvers.base import Pairs
 
 AZIMUTHS = torch.arange(24) * math.pi / 12
@@ -21,7 +22,7 @@ def scanned(prior: ExactPrior, count: int = 6) -> tuple[torch.Tensor, torch.Tens
     views = torch.rand(2 * count, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 6.0, 0.5])
     pairs = Pairs(image_of(views), torch.arange(count), torch.arange(count, 2 * count), torch.arange(count))
     poses = views[count:] - views[:count]
-    return azimuth_energies(prior, pairs, poses, AZIMUTHS, [100, 900], noises=2, seed=0), poses[:, 1]
+    return azimuth_energies(prior, pairs, poses, AZIMUTHS, Draws([100, 900], 2, seed=0)), poses[:, 1]
 
 
 def test_the_energy_is_least_at_the_truth_and_known_elsewhere():

@@ -18,24 +18,32 @@ from tiny_runs import Commands
 from view_folders import write_objects
 
 from lp_framework import load_prior
+from lp_framework.analysis.fields import (
+    Draws,
+    ExactModel,
+    field_error,
+    model_arrows,
+    pose_energies,
+    prior_field,
+    prior_landscapes,
+)
+from lp_framework.analysis.generated import generated_views
+from lp_framework.analysis.landscapes import Landscape, landscape_grid
+from lp_framework.analysis.pairs import named_pairs, truths
+from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.sources import MeshData, RenderingsData
 from lp_framework.errors import UserError
-from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
 from lp_framework.figures.cameras import CamerasFigure
 from lp_framework.figures.failures import FailuresFigure
-from lp_framework.figures.generated import generated_views
 from lp_framework.figures.landscapes import LandscapesFigure
-from lp_framework.figures.model_fields import density, field_error, model_grid
-from lp_framework.figures.prior_field import prior_field
-from lp_framework.figures.shown_pairs import shown_pairs
 from lp_framework.figures.trajectories import TrajectoriesFigure
 from lp_framework.geometry import apply_relative_pose, relative_pose
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.solvers.base import Pairs
-from lp_framework.viz.camera_methods import RED, CameraScene, camera_methods_figure, colour_of
-from lp_framework.viz.landscape_panels import FailureRow, failures_figure
-from lp_framework.viz.pictures import ExactModel
+from lp_framework.viz.cameras import RED, CameraScene, camera_methods_figure, colour_of
+from lp_framework.viz.maps import start_names
+from lp_framework.viz.panels import FailureRow, failures_figure, minima_in_words
 
 CPU = torch.device("cpu")
 VIEWS = torch.tensor([[0.1, 0.4, 1.5], [0.3, 2.9, 1.7], [-0.2, 5.0, 1.3], [0.0, 1.0, 1.6]])
@@ -60,25 +68,27 @@ def data(tmp_path_factory):
 
 def test_a_priors_field_is_minus_the_gradient_of_its_landscape():
     poses = torch.rand(2, 11, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 6.0, 0.5])
-    settings = ([100, 900], 2, 3)
+    draws = Draws([100, 900], 2, seed=3)
     prior = ExactPrior((0.0, math.pi), (0.0, 0.3), noisy=0.1)
-    field = prior_field(prior, PAIRS, poses, *settings, batch=6)
+    field = prior_field(prior, PAIRS, poses, draws._replace(batch=6))
     step = 1e-2
     for axis in range(3):
         nudge = step * torch.eye(3)[axis]
-        ahead, behind = (prior_field(prior, PAIRS, poses + sign * nudge, *settings).energy for sign in (1, -1))
+        ahead, behind = (prior_field(prior, PAIRS, poses + sign * nudge, draws).energy for sign in (1, -1))
         torch.testing.assert_close(field.score[..., axis], (behind - ahead) / (2 * step), atol=1e-3, rtol=1e-2)
     latitude, longitude = torch.tensor([-0.2, 0.3]), torch.arange(5) * (2 * math.pi / 5)
-    energies = prior_landscapes(prior, PAIRS, TRUTH[:, 2], latitude, longitude, *settings)
+    found = prior_landscapes(prior, PAIRS, TRUTH[:, 2], (latitude, longitude), draws)
+    energies = torch.stack([each.energy for each in found])
     plane = torch.cartesian_prod(latitude, longitude)
     same = torch.cat([plane.expand(2, -1, 2), TRUTH[:, None, 2:].expand(-1, 10, 1)], dim=-1)
-    torch.testing.assert_close(prior_field(prior, PAIRS, same, *settings).energy.view_as(energies), energies)
+    torch.testing.assert_close(prior_field(prior, PAIRS, same, draws).energy.view_as(energies), energies)
+    torch.testing.assert_close(pose_energies(prior, PAIRS, same, draws).view_as(energies), energies)
 
 
 def test_a_density_is_one_where_the_energy_is_least():
     latitude, longitude = landscape_grid()
     energy = 2 - longitude.cos() + latitude.square()[:, None]
-    values = density(energy, latitude, longitude, TRUTH[0]).energy
+    values = Landscape(latitude, longitude, 0.0, energy).density().energy
     assert values.max() == 1 and values.flatten()[energy.argmin()] == 1
     torch.testing.assert_close(values.log(), energy.min() - energy)
 
@@ -91,61 +101,67 @@ def test_the_exact_field_has_no_error_and_one_half_as_long_is_half_off():
 
     one = Pairs(PAIRS.images, PAIRS.reference[:1], PAIRS.query[:1], PAIRS.ids[:1])
     kernel = PoseKernel()
-    assert field_error(ExactModel(kernel, TRUTH[0]), one, TRUTH[:1]) == pytest.approx(0, abs=1e-6)
-    assert field_error(Half(kernel, TRUTH[0]), one, TRUTH[:1]) == pytest.approx(0.5, abs=1e-4)
-    grid = model_grid(ExactModel(kernel, TRUTH[0]), one, TRUTH[0])
+    assert field_error(ExactModel(kernel, TRUTH[:1]), one, TRUTH[:1], 20.0) == pytest.approx(0, abs=1e-6)
+    assert field_error(Half(kernel, TRUTH[:1]), one, TRUTH[:1], 20.0) == pytest.approx(0.5, abs=1e-4)
+    (grid,) = model_arrows(ExactModel(kernel, TRUTH[:1]), one, TRUTH[:1, 2], 20.0)
     towards = np.radians(grid.latitude[:, None]) - TRUTH[0, 0].item()
     np.testing.assert_allclose(grid.score[..., 0], np.broadcast_to(-towards, grid.score.shape[:2]), atol=1e-5)
     np.testing.assert_allclose(grid.score[..., 2], 0, atol=1e-6)  # at the true radius
 
 
 def test_pairs_are_the_views_that_were_asked_for(data):
-    shown = shown_pairs(data, ["tram", "cup"], [(2, 0), (1, 3)], CPU)
+    pairs, shown = named_pairs(data, ["tram", "cup"], [(2, 0), (1, 3)], CPU)
     table = data.table("test")
     for number, (name, places) in enumerate((("tram", (2, 0)), ("cup", (1, 3)))):
         views = table.views_of(table.names.index(name))[list(places)]
-        torch.testing.assert_close(shown.poses[number], table.poses[views])
-        for place, view in enumerate(views):
+        for view, each in zip(views, (shown[number].reference, shown[number].query), strict=True):
+            assert each.file == table.files[view] and np.array_equal(each.pose, table.poses[view])
             with Image.open(table.files[view]) as file:
                 rgba = np.asarray(file).astype(float)
             alpha = rgba[..., 3:] / 255
-            assert np.abs(rgba[..., :3] * alpha + 255 * (1 - alpha) - shown.images[number, place]).max() <= 1.5
-    assert shown.ambiguities == ["twofold", "unique"]
-    torch.testing.assert_close(shown.truth, relative_pose(shown.poses[:, 0], shown.poses[:, 1]).float())
+            assert np.abs(rgba[..., :3] * alpha + 255 * (1 - alpha) - each.image).max() <= 1.5
+        image = pairs.images[pairs.reference[number]].permute(1, 2, 0).numpy()
+        np.testing.assert_allclose(image, shown[number].reference.image / 127.5 - 1, atol=1e-6)
+    assert [(pair.object, pair.ambiguity) for pair in shown] == [("tram", "twofold"), ("cup", "unique")]
+    reference, query = (
+        torch.from_numpy(np.stack([getattr(pair, side).pose for pair in shown])) for side in ("reference", "query")
+    )
+    torch.testing.assert_close(truths(shown), relative_pose(reference, query).float())
     for wrong, message in (
         ((["cup"], [(0, 4)]), "object 'cup' has test views 0 to 3, there is no query 4"),
         ((["cup"], [(1, 1)]), "reference and query must be two views, got 1 for both"),
         ((["cap"], [(0, 1)]), "no object 'cap'; did you mean 'cup'"),
     ):
         with pytest.raises(UserError, match=message):
-            shown_pairs(data, *wrong, CPU)
+            named_pairs(data, *wrong, CPU)
 
 
 def test_landscapes_say_how_many_minima_they_have(data):
     def gathered(prior):
-        return LandscapesFigure(data, prior, ["cup"], timesteps=[500]).gather(0, CPU)[0]
+        return LandscapesFigure(data, prior, ["cup"], timesteps=[500]).analyse(0, CPU)[0].prior_energy
 
     both, one = gathered(TWO_VALLEYS), gathered(ExactPrior())
-    assert (both.word, one.word) == ("2 minima", "1 minimum")
-    assert both.landscape.energy.shape == (16, 30)
-    assert gathered(ExactPrior(stiffness=0.0)).word == "plateau"  # nothing to tell anywhere
+    assert (minima_in_words(both), minima_in_words(one)) == ("2 minima", "1 minimum")
+    assert both.energy.shape == (16, 30)
+    assert minima_in_words(gathered(ExactPrior(stiffness=0.0))) == "plateau"  # nothing to tell anywhere
 
 
 def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
     figure = TrajectoriesFigure(data, ExactPrior(), "cup", 1, 2, steps=40, views=3, timesteps=[500])
-    contents = figure.gather(0, CPU)
-    assert contents.trajectories.shape == (4, 41, 3) and contents.steps == [0, 10, 40]
-    np.testing.assert_allclose(np.degrees(contents.trajectories[:, 0, 1]) % 360, [0, 90, 180, 270], atol=1e-3)
-    assert [row.start for row in contents.rows] == ["0°", "90°", "180°", "270°"]
+    contents = figure.analyse(0, CPU)
+    trajectories = contents.pair.trajectories
+    assert trajectories.shape == (4, 41, 3) and contents.steps == [0, 10, 40]
+    np.testing.assert_allclose(np.degrees(trajectories[:, 0, 1]) % 360, [0, 90, 180, 270], atol=1e-3)
+    assert start_names(contents.pair) == ["0°", "90°", "180°", "270°"]
     # An image of this prior holds its pose in the first three numbers: the views' are those of the trajectory.
-    shown = shown_pairs(data, ["cup"], [(1, 2)], CPU)
-    pose = shown.pairs.images[shown.pairs.reference][0].flatten()[:3]
-    for row, path in zip(contents.rows, contents.trajectories, strict=True):
-        generated = 2 * row.views.transpose(0, 3, 1, 2).reshape(3, -1)[:, :3] - 1
+    pairs, _ = named_pairs(data, ["cup"], [(1, 2)], CPU)
+    pose = pairs.images[pairs.reference][0].flatten()[:3]
+    for views, path in zip(contents.views, trajectories, strict=True):
+        generated = 2 * views.transpose(0, 3, 1, 2).reshape(3, -1)[:, :3] - 1
         np.testing.assert_allclose(generated, np.clip(pose.numpy() + path[contents.steps], -1, 1), atol=1e-5)
 
 
-def test_generated_views_differ_by_their_poses_alone(monkeypatch):
+def test_generated_views_differ_by_their_poses_alone():
     """Whatever comes along with them."""
     prior = load_prior("tiny")
     source = prior.encode(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)) * 2 - 1)
@@ -154,8 +170,7 @@ def test_generated_views_differ_by_their_poses_alone(monkeypatch):
     assert together.shape == (3, 64, 64, 3)
     np.testing.assert_allclose(together[0], together[2], atol=1e-6)
     assert np.abs(together[0] - together[1]).max() > 0.01
-    monkeypatch.setattr("lp_framework.figures.generated.AT_ONCE", 2)
-    np.testing.assert_allclose(generated_views(prior, source, poses, 5, 1.0, seed=4), together, atol=1e-5)
+    np.testing.assert_allclose(generated_views(prior, source, poses, 5, 1.0, seed=4, batch=2), together, atol=1e-5)
 
 
 # ---------------------------------------------------------------- cameras
@@ -186,15 +201,17 @@ def test_a_camera_panel_has_every_camera():
 
 def test_predicted_cameras_stand_where_the_solver_says(data):
     figure = CamerasFigure(data, ExactPrior(), ["cup", "tram"], targets=5, methods=["ifusion"], starts=2)
-    contents = figure.gather(0, CPU)
+    contents = figure.analyse(0, CPU)
     assert [scene.title for scene in contents.scenes] == ["cup", "tram"] and contents.methods == ["iFusion"]
     places = [(0, 1), (0, 2), (0, 3)]  # there are no more
-    shown = shown_pairs(data, ["cup"] * 3 + ["tram"] * 3, places * 2, CPU)
-    solution = figure.solvers["ifusion"].solve(shown.pairs, figure.starts.make(shown.pairs, 0), 0)
-    cameras = apply_relative_pose(shown.poses[:, :1], solution.poses.detach().double()).numpy()
+    pairs, shown = named_pairs(data, ["cup"] * 3 + ["tram"] * 3, places * 2, CPU)
+    solution = figure.solvers["ifusion"].solve(pairs, figure.starts.make(pairs, 0), 0)
+    references = torch.from_numpy(np.stack([pair.reference.pose for pair in shown]))
+    cameras = apply_relative_pose(references[:, None], solution.poses.detach().double()).numpy()
     for number, scene in enumerate(contents.scenes):
         np.testing.assert_allclose(scene.predicted[0], cameras[3 * number : 3 * number + 3], atol=1e-6)
-        np.testing.assert_allclose(scene.poses[1:], shown.poses[3 * number : 3 * number + 3, 1].numpy())
+        own = shown[3 * number : 3 * number + 3]
+        np.testing.assert_allclose(scene.poses[1:], np.stack([pair.query.pose for pair in own]))
         assert scene.images.shape == (4, 16, 16, 3) and scene.words[0].endswith("of 6 within 15°")
 
 
@@ -221,26 +238,28 @@ def meshes(tmp_path_factory):
 
 def test_a_rendered_view_at_the_references_own_pose_is_the_reference(meshes):
     figure = FailuresFigure(meshes, TWO_VALLEYS, ["box"], views=4, timesteps=[500])
-    contents = figure.gather(0, CPU)
+    contents = figure.analyse(0, CPU)
     assert contents.longitudes_degrees == [0, 90, 180, 270]
     row = contents.rows[0]
     assert row.rendered is not None and row.rendered.shape == (4, 256, 256, 3) and len(row.generated) == 4
     small = row.rendered[0].reshape(64, 4, 64, 4, 3).mean(axis=(1, 3))
-    assert np.abs(small - row.reference / 255).mean() < 0.01
+    assert np.abs(small - row.pair.reference.image / 255).mean() < 0.01
     assert np.abs(row.rendered[1] - row.rendered[0]).mean() > 0.02
     # Half a turn around is the reference's pose again, half a turn on.
-    pose = shown_pairs(meshes, ["box"], [(0, 1)], CPU).poses[0, :1]
+    _, (shown,) = named_pairs(meshes, ["box"], [(0, 1)], CPU)
+    pose = torch.from_numpy(shown.reference.pose)[None]
     turned = figure.rendered("box", pose + torch.tensor([0.0, math.pi, 0.0]))
     assert turned is not None
     np.testing.assert_allclose(turned[0], row.rendered[2], atol=1 / 255)
 
 
 def test_without_a_mesh_there_is_only_what_the_prior_generates(data):
-    contents = FailuresFigure(data, TWO_VALLEYS, ["vase"], views=3, timesteps=[500]).gather(0, CPU)
+    contents = FailuresFigure(data, TWO_VALLEYS, ["vase"], views=3, timesteps=[500]).analyse(0, CPU)
     assert contents.rows[0].rendered is None
-    image, views = np.zeros((8, 8, 3)), np.zeros((3, 8, 8, 3))
+    view, views = View(Path("0.png"), np.zeros((8, 8, 3)), np.zeros(3)), np.zeros((3, 8, 8, 3))
     slope = Landscape(*landscape_grid(), 0.0, torch.linspace(0, 1, 480).view(16, 30))
-    row = FailureRow("vase", image, image, None, views, slope, np.zeros(3))
+    pair = ShownPair("vase", "continuous", "", view, view, np.zeros(3), landscapes={PRIOR_ENERGY: slope})
+    row = FailureRow(pair, None, views)
     bare = failures_figure([row], [0, 120, 240])
     both = failures_figure([row._replace(rendered=views)], [0, 120, 240])
     assert len(both.axes) == len(bare.axes) + 3

@@ -19,20 +19,20 @@ from exact_prior import ExactPrior, image_of
 from page_runs import NASTY, STEPS, WRITERS, example, torch_equal, write_evaluation, write_training
 from PIL import Image
 
-from lp_framework.data.pairs import PairBatch, PairData, ViewTable
-from lp_framework.data.views import ObjectViews
-from lp_framework.errors import UserError
-from lp_framework.evaluation import examples as examples_module
-from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.evaluation.examples import (
+from lp_framework.analysis import examples as examples_module
+from lp_framework.analysis.examples import (
     FILE,
     MOST,
     gather_examples,
     pick_examples,
     read_examples,
-    recording,
     save_examples,
 )
+from lp_framework.analysis.pairs import recording
+from lp_framework.data.pairs import PairBatch, PairData, ViewTable
+from lp_framework.data.views import ObjectViews
+from lp_framework.errors import UserError
+from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.geometry import camera_to_world, wrap_angle
 from lp_framework.models.pose_model import FieldValue
 from lp_framework.report.runs import run_folders, run_kind

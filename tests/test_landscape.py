@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 from landscapes import of, wells
 from solver_problems import ExactModel, exact_pairs
 
+from lp_framework.analysis.fields import Draws, model_field, pose_energies, prior_landscapes
+from lp_framework.analysis.landscapes import Landscape, landscape_grid
 from lp_framework.errors import UserError
-from lp_framework.evaluation.landscape import (
-    Landscape,
-    landscape_grid,
-    model_landscape,
-    pose_energies,
-    prior_landscapes,
-)
 
 GRID = landscape_grid()
 
@@ -178,12 +173,15 @@ class Counted(ExactPrior):
 
 def test_energies_are_the_closed_form():
     pairs, true = exact_pairs(3)
-    energies = prior_landscapes(ExactPrior(), pairs, true[:, 2] + 0.2, *GRID, timesteps=[100, 900], noises=2, seed=0)
+    found = prior_landscapes(ExactPrior(), pairs, true[:, 2] + 0.2, GRID, Draws([100, 900], 2, seed=0))
     latitude, longitude = GRID
-    for energy, truth in zip(energies, true, strict=True):
+    for landscape, truth in zip(found, true, strict=True):
+        assert landscape.radius == pytest.approx(truth[2].item() + 0.2)
         up = (latitude - truth[0]).square()[:, None] + 0.2**2
-        torch.testing.assert_close(energy, up / 2 + (1 - (longitude - truth[1]).cos()) / 2, atol=1e-5, rtol=1e-4)
-        minima = Landscape(*GRID, 0.0, energy).minima()
+        torch.testing.assert_close(
+            landscape.energy, up / 2 + (1 - (longitude - truth[1]).cos()) / 2, atol=1e-5, rtol=1e-4
+        )
+        minima = landscape.minima()
         assert len(minima) == 1 and abs(minima[0].longitude - truth[1]) < math.radians(1)
         assert abs(minima[0].latitude - truth[0]) < math.radians(1)
 
@@ -193,15 +191,18 @@ def test_batches_bound_the_memory_and_change_nothing(batch):
     pairs, true = exact_pairs(3)
     prior = Counted(noisy=0.3)
     coarse = landscape_grid(60, 20, 40)  # 7 x 9
-    draws = {"timesteps": [100, 900], "noises": 2, "seed": 0}
-    energies = prior_landscapes(prior, pairs, true[:, 2], *coarse, **draws, batch=batch)
+    draws = Draws([100, 900], 2, seed=0)
+    found = prior_landscapes(prior, pairs, true[:, 2], coarse, draws._replace(batch=batch))
     assert max(prior.sizes) <= 2 * batch and sum(prior.sizes) == 3 * 63 * 4 * 2
     assert prior.encoded == len(pairs.images)  # each once
-    whole = prior_landscapes(prior, pairs, true[:, 2], *coarse, **draws)
-    torch.testing.assert_close(energies, whole)
+    whole = prior_landscapes(prior, pairs, true[:, 2], coarse, draws)
+    for one, other in zip(found, whole, strict=True):
+        torch.testing.assert_close(one.energy, other.energy)
     alone, _ = exact_pairs(3)
     poses = torch.cat([torch.cartesian_prod(*coarse), true[1, 2].expand(63, 1)], dim=1)
-    torch.testing.assert_close(pose_energies(prior, alone, poses.expand(3, -1, -1), **draws)[1].view(7, 9), whole[1])
+    torch.testing.assert_close(
+        pose_energies(prior, alone, poses.expand(3, -1, -1), draws)[1].view(7, 9), whole[1].energy
+    )
 
 
 def test_noises_are_those_of_the_seed_and_the_pair():
@@ -209,14 +210,15 @@ def test_noises_are_those_of_the_seed_and_the_pair():
     prior, coarse = ExactPrior(noisy=0.3), landscape_grid(60, 40, 40)
 
     def energies(seed):
-        return prior_landscapes(prior, pairs, true[:, 2], *coarse, timesteps=[500], noises=3, seed=seed)
+        found = prior_landscapes(prior, pairs, true[:, 2], coarse, Draws([500], 3, seed))
+        return torch.stack([each.energy for each in found])
 
     assert torch.equal(energies(1), energies(1)) and not torch.equal(energies(1), energies(2))
 
 
 def test_a_models_field_on_the_grid():
     pairs, true = exact_pairs(2)
-    field = model_landscape(ExactModel(), pairs, true[:, 2], *GRID)
+    field = model_field(ExactModel(), pairs, true[:, 2], GRID)
     assert field.energy is None and field.score.shape == (2, 16, 30, 3)
     expected = torch.stack(torch.meshgrid(*GRID, indexing="ij"), dim=-1)
     torch.testing.assert_close(field.score[1, ..., :2], true[1, :2] - expected)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +12,14 @@ import torch
 from PIL import Image
 from tiny_runs import Commands
 
-from lp_framework.commands.pair_landscape import Shown, descended
+from lp_framework.analysis.landscapes import Landscape
+from lp_framework.analysis.pairs import with_solution
+from lp_framework.analysis.shown import ShownPair, View
+from lp_framework.commands.landscape import start_longitudes
 from lp_framework.data.views import read_views
-from lp_framework.evaluation.landscape import Landscape
 from lp_framework.geometry import relative_pose
-from lp_framework.solvers.base import Cost, Pairs, Solution
+from lp_framework.solvers.base import Cost, Solution
+from lp_framework.viz.maps import captions
 
 COARSE = ("latitude_step_degrees=40", "longitude_step_degrees=60", "timesteps=[500]")
 SHORT = ("solver.steps=3", "reference=0", "query=2", *COARSE)
@@ -100,19 +105,22 @@ def test_a_pair_of_photographs_has_no_truth(commands):
 
 
 def test_a_start_that_came_to_no_pose_is_left_out():
-    pairs = Pairs(torch.zeros(2, 3, 8, 8), torch.tensor([0]), torch.tensor([1]), torch.tensor([0]))
     starts = torch.tensor([[[0.0, 0, 0], [0, 1, 0], [0, 2, 0]]])
     poses = starts.clone()
     poses[0, 1] = math.nan
     cost = Cost(0, 0.0)
     solution = Solution(poses, torch.tensor([[1.0, math.nan, 0.5]]), poses.isfinite().all(-1), torch.tensor([2]), cost)
-    truth = torch.tensor([0.0, 2.0, 0.0])
-    found = descended(Shown("", [], pairs, truth, torch.tensor([0.0, 0.0, 1.5])), solution, starts)
-    assert found.starts == pytest.approx([0, math.degrees(2)]) and found.chosen == 1
-    assert found.errors == pytest.approx([math.degrees(2), 0], abs=1e-3)
-    assert found.captions() == ["0°: 115° off", "115°: 0° off"] and found.energies == [1.0, 0.5]
-    own = descended(Shown("", [], pairs, None, None), solution, starts[:, :2])
-    assert own.starts is None and own.errors is None and own.captions() == ["", ""]
+    view = View(Path("a.png"), np.zeros((8, 8, 3), dtype=np.uint8), np.array([0.0, 0.0, 1.5]))
+    pair = ShownPair("", "", "", view, view, np.array([0.0, 2.0, 0.0]))
+    found = with_solution(pair, solution, starts, 0).arrived()
+    assert start_longitudes(found) == pytest.approx([0, math.degrees(2)]) and found.chosen == 1
+    assert found.rotation_errors == pytest.approx([math.degrees(2), 0], abs=1e-3)
+    assert captions(found) == ["0°: 115° off", "115°: 0° off"] and found.energies.tolist() == [1.0, 0.5]
+    own = with_solution(replace(pair, truth=None), solution, starts[:, :2], 0).arrived()
+    assert own.starts is None and np.isnan(own.rotation_errors).all() and captions(own) == ["", ""]
+    assert start_longitudes(own) == [None, None]
+    lost = with_solution(pair, replace(solution, chosen=torch.tensor([1])), starts, 0).arrived()
+    assert lost.chosen is None and lost.failed and len(lost.ends) == 2
 
 
 # ---------------------------------------------------------------- all objects

@@ -13,9 +13,9 @@ import torch
 from tiny_runs import OBJECTS, Commands, Ran
 from view_folders import write_objects
 
+from lp_framework.analysis.examples import read_examples
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
-from lp_framework.evaluation.examples import read_examples
 from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution
 from lp_framework.solvers.starts import Random

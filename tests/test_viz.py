@@ -17,10 +17,14 @@ from matplotlib.image import imread
 from matplotlib.quiver import Quiver
 from torch import Tensor, nn
 
+from lp_framework.analysis.examples import EXAMPLES, gather_examples, pick_pairs, read_examples
+from lp_framework.analysis.fields import ExactModel, grid_poses, model_arrows, model_field
+from lp_framework.analysis.landscapes import Arrows, PoseMap, Ways, cell_grid
+from lp_framework.analysis.shown import ShownPair, View
+from lp_framework.commands.eval_pictures import save_pictures
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews
 from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.evaluation.examples import EXAMPLES, pick_pairs, read_examples
 from lp_framework.evaluation.metrics import summarise
 from lp_framework.geometry import camera_to_world, wrap_angle
 from lp_framework.models.backbones import Backbone
@@ -32,13 +36,20 @@ from lp_framework.solvers.starts import Grid as GridStarts
 from lp_framework.solvers.starts import Ring
 from lp_framework.viz import errors_plot
 from lp_framework.viz.errors_plot import ObjectCard, cumulative, errors_figure, objects_figure
-from lp_framework.viz.fields import FieldMap, Grid, broken_at_seam, field_figure, field_on_grid, pose_grid
-from lp_framework.viz.pictures import ExactModel, pair_contents, save_pictures, save_training_picture
+from lp_framework.viz.maps import broken_at_seam, draw_map, field_figure
 from lp_framework.viz.style import ANSWER, save_figure
-from lp_framework.viz.training import Curve, read_curves, training_figure
+from lp_framework.viz.training import Curve, read_curves, save_training_picture, training_figure
 
 TRUTH = torch.tensor([0.3, 5.6, 0.2])
 IMAGE = np.zeros((8, 8, 3), dtype=np.uint8)
+PAIR = Pairs(torch.zeros(2, 3, 8, 8), torch.tensor([0]), torch.tensor([1]), torch.tensor([0]))
+
+
+def pair_of(maps: list[PoseMap], truth: np.ndarray) -> ShownPair:
+    """A pair with maps."""
+    view = View(Path("000.png"), IMAGE, np.zeros(3))
+    return ShownPair("tram", "twofold", "", view, view, truth, maps=maps)
+
 
 # ------------------------------------------------------------ trajectories at the seam
 
@@ -73,20 +84,21 @@ def test_path_that_stays_on_the_map_is_left_alone():
 
 
 def test_grid_fills_the_map_at_one_radius():
-    poses = pose_grid(0.25, 12.0)
-    assert poses.shape == (10, 30, 3) and poses.dtype == torch.float32
-    latitude, longitude = torch.rad2deg(poses[:, 0, 0]), torch.rad2deg(poses[0, :, 1])
+    grid = cell_grid(12.0)
+    latitude, longitude = (torch.rad2deg(each) for each in grid)
     torch.testing.assert_close(latitude, torch.arange(-54.0, 60.0, 12.0))
     torch.testing.assert_close(longitude, torch.arange(6.0, 360.0, 12.0))
-    assert (poses[..., 2] == 0.25).all()
+    poses = grid_poses(torch.tensor([0.25, 0.5]), *grid)
+    assert poses.shape == (2, 10, 30, 3) and poses.dtype == torch.float32
+    assert (poses[0, ..., 2] == 0.25).all() and (poses[1, ..., 2] == 0.5).all()
+    assert torch.equal(poses[1, :, 3, 0], grid[0]) and torch.equal(poses[1, 3, :, 1], grid[1])
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0])
 @pytest.mark.parametrize("target", ["line", "periodic"])
 def test_exact_field_on_the_grid_is_the_closed_form(target: str, sigma: float):
-    model = ExactModel(PoseKernel(target, sigma), TRUTH, has_energy=True)
-    condition = model.condition(*model.encode(torch.zeros(2, 3, 8, 8))[:, None])
-    grid = field_on_grid(lambda pose: model.field(condition, pose), radius=0.4, spacing=12.0)
+    model, radius = ExactModel(PoseKernel(target, sigma), TRUTH[None], has_energy=True), torch.tensor([0.4])
+    (grid,) = model_arrows(model, PAIR, radius, spacing=12.0)
     latitude, longitude = np.meshgrid(np.deg2rad(grid.latitude), np.deg2rad(grid.longitude), indexing="ij")
     dlat, dlon = latitude - TRUTH[0].item(), longitude - TRUTH[1].item()
     turns = 2 * math.pi * np.arange(-9, 10) if target == "periodic" else np.zeros(1)
@@ -97,24 +109,26 @@ def test_exact_field_on_the_grid_is_the_closed_form(target: str, sigma: float):
     )
     np.testing.assert_allclose(grid.score, expected / sigma**2, atol=2e-5 / sigma**4)
     energy = (dlat**2 + 0.2**2) / (2 * sigma**2) - np.log(density.sum(-1))
-    assert grid.energy is not None
-    np.testing.assert_allclose(grid.energy - grid.energy.min(), energy - energy.min(), atol=2e-5)
+    found = model_field(model, PAIR, radius, cell_grid(12.0)).energy
+    assert found is not None
+    np.testing.assert_allclose(found[0] - found.min(), energy - energy.min(), atol=2e-5)
 
 
-def exact_map(starts: int = 3) -> FieldMap:
+def exact_map(starts: int = 3) -> PoseMap:
     kernel = PoseKernel()
     start = torch.tensor([[0.0, 0.0, 0.0], [0.4, 2.0, 0.0], [-0.4, 4.0, 0.0]])[:starts]
     path = [start]
     for _ in range(60):
         path.append(path[-1] + 0.1 * kernel.score(path[-1], TRUTH))
-    arrows = field_on_grid(lambda pose: (kernel.score(pose, TRUTH), None), 0.2, 12.0)
+    (arrows,) = model_arrows(ExactModel(kernel, TRUTH[None]), PAIR, torch.tensor([0.2]), 12.0)
     paths = torch.stack(path, dim=1).numpy()
-    return FieldMap("Exact score", arrows, None, start.numpy(), paths, paths[:, -1], chosen=starts - 1)
+    ways = Ways(paths[:, -1], starts - 1, start.numpy(), paths)
+    return PoseMap("Exact score", arrows=arrows, ways=ways)
 
 
 def test_field_figure_shows_arrows_ways_answer_and_truth():
     content = exact_map()
-    figure = field_figure(IMAGE, IMAGE, TRUTH.numpy(), [content, content], "tram (twofold)", "worst: 36°")
+    figure = field_figure(pair_of([content, content], TRUTH.numpy()), "tram (twofold)", "worst: 36°")
     maps = [axes for axes in figure.axes if axes.get_title("left") == "Exact score"]
     assert len(maps) == 2 and [axes.get_title("left") for axes in figure.axes[:2]] == ["reference", "query"]
     assert "tram (twofold)" in [text.get_text() for text in figure.texts]
@@ -144,16 +158,25 @@ def test_field_figure_shows_arrows_ways_answer_and_truth():
 
 def test_map_of_steep_views_shows_the_truth():
     steep = np.array([1.4, 0.0, 0.0])
-    figure = field_figure(IMAGE, IMAGE, steep, [FieldMap("Starts and answer")], "a", "b")
+    figure = field_figure(pair_of([PoseMap("Starts and answer")], steep), "a", "b")
     assert figure.axes[-1].get_ylim() == (-90, 90)
 
 
 def test_broken_model_is_drawn_too():
     content = exact_map(1)
-    assert content.arrows is not None and content.paths is not None
-    nowhere = Grid(content.arrows.latitude, content.arrows.longitude, np.full_like(content.arrows.score, np.nan))
-    lost = FieldMap("Learned score", nowhere, None, content.starts, content.paths * np.nan, content.ends, 0)
-    field_figure(IMAGE, IMAGE, TRUTH.numpy(), [lost, lost], "a", "b").draw_without_rendering()
+    assert content.arrows is not None and content.ways is not None and content.ways.paths is not None
+    nowhere = content.arrows._replace(score=np.full_like(content.arrows.score, np.nan))
+    lost = PoseMap(
+        "Learned score", arrows=nowhere, ways=content.ways._replace(chosen=0, paths=content.ways.paths * np.nan)
+    )
+    field_figure(pair_of([lost, lost], TRUTH.numpy()), "a", "b").draw_without_rendering()
+
+
+def test_arrows_are_drawn_in_the_scale_that_they_are_given():
+    arrows = Arrows(np.array([-30.0, 30.0]), np.array([90.0, 270.0]), np.full((2, 2, 3), 0.5))
+    for given, scale in ((arrows, math.sqrt(0.5)), (arrows._replace(scale=2.0), 2.0)):
+        quiver = draw_map(Figure().add_subplot(), PoseMap(arrows=given))
+        assert quiver is not None and quiver.norm.vmax == pytest.approx(scale)
 
 
 # ------------------------------------------------------------ which pairs
@@ -384,28 +407,40 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
     model = kind(Means(), hidden=8, layers=1)
     solver = Langevin(model, gamma=0.0, iterations=100)
     evaluation = evaluated(solver, data, GridStarts())
-    batch = data[data.table.pairs()[:1]]
-    _, _, truth, (learned, exact) = pair_contents(evaluation, batch)
+    rows = evaluation.metrics.rows()
+    examples = gather_examples(evaluation, data)
     assert solver.trajectory is False and solver.model is model  # the evaluated solver stays as it was
-    np.testing.assert_allclose(truth, batch.relative_poses()[0])
-    assert learned.paths is not None and learned.paths.shape == (9, 101, 3)
-    # Solved again, the pair has the evaluation's answer.
-    answer = evaluation.metrics.rows()["answer"][0].numpy()
-    assert learned.ends is not None and learned.chosen is not None
-    np.testing.assert_allclose(learned.ends[learned.chosen], answer, atol=1e-4)
-    # The arrows are the model's score at the true radius.
-    assert batch.pixels is not None and learned.arrows is not None and exact.arrows is not None
-    features = model.encode(batch.images)
-    condition = model.condition(features[batch.reference], features[batch.query])
-    pose = pose_grid(float(truth[2]), 12.0)
-    np.testing.assert_allclose(learned.arrows.score, model.field(condition, pose).score.detach(), atol=1e-5)
-    np.testing.assert_allclose(exact.arrows.score, model.kernel.score(pose, torch.tensor(truth)), atol=1e-6)
-    # With the exact score every start arrives.
-    assert exact.ends is not None
-    offset = torch.tensor(exact.ends - truth)
-    offset[:, 1] = wrap_angle(offset[:, 1])
-    assert offset.abs().max() < 2e-2
-    assert (learned.density is not None) == (exact.density is not None) == (kind is EnergyModel)
+    assert 3 <= len(examples) <= 4 and all(len(pair.maps) == 2 for pair in examples)
+    for pair in examples:
+        learned, exact = pair.maps
+        views = [
+            next(
+                view
+                for view in data.table.views_of(data.table.names.index(pair.object))
+                if data.table.files[view].name == each.name
+            )
+            for each in (pair.reference, pair.query)
+        ]
+        batch, truth = data[np.array([views])], torch.from_numpy(pair.truth)
+        np.testing.assert_allclose(pair.truth, batch.relative_poses()[0])
+        assert learned.ways is not None and learned.ways.paths is not None
+        assert learned.ways.paths.shape == (9, 101, 3) and learned.ways.chosen is not None
+        # Solved again, the pair has the evaluation's answer.
+        answer = rows["answer"][rows["pair"] == batch.pairs[0]][0].numpy()
+        np.testing.assert_allclose(learned.ways.ends[learned.ways.chosen], answer, atol=1e-4)
+        # The arrows are the model's score at the true radius.
+        assert batch.pixels is not None and learned.arrows is not None and exact.arrows is not None
+        features = model.encode(batch.images)
+        condition = model.condition(features[batch.reference], features[batch.query])
+        (pose,) = grid_poses(truth[2:], *cell_grid(12.0))
+        np.testing.assert_allclose(learned.arrows.score, model.field(condition, pose).score.detach(), atol=1e-5)
+        np.testing.assert_allclose(exact.arrows.score, model.kernel.score(pose, truth), atol=1e-6)
+        # With the exact score every start arrives.
+        assert exact.ways is not None
+        offset = torch.from_numpy(exact.ways.ends) - truth
+        offset[:, 1] = wrap_angle(offset[:, 1])
+        assert offset.abs().max() < 2e-2
+        assert (learned.density is not None) == (exact.density is not None) == (kind is EnergyModel)
 
 
 @pytest.mark.parametrize(("with_model", "count"), [(True, 4), (False, 1)])
@@ -427,8 +462,9 @@ def test_pictures_of_an_evaluation(with_model: bool, count: int, data: PairData,
 
 def test_solver_without_model_has_one_map_without_arrows(data: PairData):
     evaluation = evaluated(Guess(), data, Ring(4))
-    _, _, _, maps = pair_contents(evaluation, data[data.table.pairs()[:1]])
-    assert len(maps) == 1 and maps[0].arrows is None and maps[0].paths is None
-    figure = field_figure(IMAGE, IMAGE, TRUTH.numpy(), maps, "a", "b")
+    pair = gather_examples(evaluation, data)[0]
+    (content,) = pair.maps
+    assert content.arrows is None and content.ways is not None and content.ways.paths is None
+    figure = field_figure(pair, "a", "b")
     assert len(figure.axes) == 3  # two images, one map, no colour bar
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["true pose", "answer"]

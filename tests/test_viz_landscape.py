@@ -14,8 +14,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from lp_framework.viz.landscape import RELIEF, draw_map, map_figure, pair_figure, surface_figure
+from lp_framework.analysis.landscapes import PoseMap, Ways
+from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
+from lp_framework.viz.maps import RELIEF, draw_map, map_figure, pair_figure
 from lp_framework.viz.style import ANSWER, save_figure
+from lp_framework.viz.surface import surface_figure
 
 PICTURES = Path(__file__).parent / "pictures"
 LANDSCAPE = wells((10, 50, 1.0), (-20, 230, 0.7), width=3.0)
@@ -34,6 +37,11 @@ WAYS = np.stack(
 )  # fmt: skip
 
 
+def took(paths: NDArray, chosen: int | None = None) -> Ways:
+    """The ways of a solver along paths `[N, S, 3]`."""
+    return Ways(paths[:, -1], chosen, paths[:, 0], paths)
+
+
 def lines(axes) -> list[NDArray]:
     """The ways that are drawn, `[points, 2]`: longitude and latitude in degrees, NaN where a line breaks."""
     return [np.array(line.get_data(), dtype=float).T for line in axes.lines if line.get_linestyle() != "None"]
@@ -50,7 +58,7 @@ def marks(axes, marker: str) -> list[tuple[float, float]]:
 def test_a_way_across_the_seam_draws_no_line_across_the_map():
     axes = Figure().add_subplot()
     ways = np.stack([way((0, 340), (5, 355), (10, 370), (15, 410)), way((0, 20), (0, -20), (0, -200), (0, -380))])
-    draw_map(axes, LANDSCAPE, ways)
+    draw_map(axes, PoseMap(relief=LANDSCAPE, ways=took(ways)))
     first, second = lines(axes)
     assert np.nanmax(np.abs(np.diff(first[:, 0]))) <= 180 and np.nanmin(first) >= -60 and np.nanmax(first) <= 360
     assert np.isnan(first[:, 0]).sum() == 1 and np.isnan(second[:, 0]).sum() == 2
@@ -60,7 +68,7 @@ def test_a_way_across_the_seam_draws_no_line_across_the_map():
 
 def test_the_map_shows_minima_truth_starts_ends_and_the_answer():
     axes = Figure().add_subplot()
-    draw_map(axes, LANDSCAPE, WAYS, TRUTH, chosen=1, title="duck")
+    draw_map(axes, PoseMap("duck", relief=LANDSCAPE, ways=took(WAYS, 1)), TRUTH)
     assert marks(axes, "*") == [pytest.approx((50, 10))]
     assert marks(axes, "D") == [pytest.approx((50, 10))]
     found = sorted(marks(axes, "+"))
@@ -74,7 +82,7 @@ def test_the_map_shows_minima_truth_starts_ends_and_the_answer():
 
 def test_without_trajectories_and_truth_there_is_only_the_landscape():
     axes = Figure().add_subplot()
-    draw_map(axes, LANDSCAPE)
+    draw_map(axes, PoseMap(relief=LANDSCAPE))
     assert (
         not lines(axes) and not marks(axes, "o") and not [each for each in marks(axes, "*") if np.isfinite(each).all()]
     )
@@ -83,13 +91,13 @@ def test_without_trajectories_and_truth_there_is_only_the_landscape():
 
 def test_ends_alone_are_no_starts():
     axes = Figure().add_subplot()
-    draw_map(axes, LANDSCAPE, WAYS[:, -1:], TRUTH, chosen=0)
+    draw_map(axes, PoseMap(relief=LANDSCAPE, ways=Ways(WAYS[:, -1], 0)), TRUTH)
     assert {round(longitude) for longitude, _ in marks(axes, "o")} == {50, 230} and not lines(axes)
 
 
 def test_360_degrees_is_0_again():
     axes = Figure().add_subplot()
-    relief = draw_map(axes, LANDSCAPE)
+    relief = draw_map(axes, PoseMap(relief=LANDSCAPE))
     energy = np.asarray(relief.get_array()).reshape(16, 31)
     assert np.array_equal(energy[:, 0], energy[:, -1]) and np.allclose(energy[:, :-1], LANDSCAPE.energy)
 
@@ -115,10 +123,14 @@ def test_the_map_says_the_same_in_grey():
 @pytest.mark.parametrize("count", [0, 1, 4, 9])
 def test_a_page_of_a_pair_has_all_in_its_place(count):
     views = [IMAGE] * count
-    captions = [f"{90 * number}\u00b0: {number}\u00b0 off" for number in range(count)]
-    ways = np.repeat(WAYS[:1], count, axis=0) if count else None
-    chosen = 0 if count else None
-    figure = pair_figure(IMAGE, IMAGE, LANDSCAPE, ways, TRUTH, chosen, views, captions, "duck", "note", "tiny")
+    captions = [f"{90 * number % 360}\u00b0: {number}\u00b0 off" for number in range(count)]
+    ways, view = np.repeat(WAYS[:1], count, axis=0), View(Path("000.png"), IMAGE, TRUTH)
+    ways[:, 0, 1] = np.radians(90 * np.arange(count))
+    pair = ShownPair(
+        "duck", "unique", "", view, view, TRUTH, ways[:, 0], ways, ways[:, -1], np.zeros(count), 0 if count else None,
+        np.arange(count, dtype=float), landscapes={PRIOR_ENERGY: LANDSCAPE},
+    )  # fmt: skip
+    figure = pair_figure(pair, views, "duck", "note", "tiny")
     figure.draw_without_rendering()
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles[:3] == ["reference", "query", "tiny"] and [each for each in titles if "off" in each] == captions
@@ -139,7 +151,7 @@ def test_a_page_of_a_pair_has_all_in_its_place(count):
 
 
 def test_a_long_key_stays_on_the_page():
-    figure = map_figure(LANDSCAPE, WAYS, TRUTH, 0, "tram")
+    figure = map_figure(LANDSCAPE, took(WAYS, 0), TRUTH, "tram")
     figure.draw_without_rendering()
     key = figure.legends[0].get_window_extent()
     assert key.x0 >= 0 and key.y0 >= 0 and key.x1 <= figure.bbox.x1
@@ -182,7 +194,7 @@ def difference(one: NDArray, other: NDArray) -> float:
 
 
 FIGURES = {
-    "landscape_map": lambda: map_figure(LANDSCAPE, WAYS, TRUTH, 1, "wells"),
+    "landscape_map": lambda: map_figure(LANDSCAPE, took(WAYS, 1), TRUTH, "wells"),
     "landscape_surface": lambda: surface_figure(LANDSCAPE, TRUTH, "wells"),
 }
 
@@ -197,7 +209,7 @@ def test_pictures_look_as_they_did(name):
 
 
 def test_pictures_are_written(tmp_path):
-    files = save_figure(map_figure(LANDSCAPE, WAYS, TRUTH, 1), tmp_path / "map")
+    files = save_figure(map_figure(LANDSCAPE, took(WAYS, 1), TRUTH), tmp_path / "map")
     assert [file.suffix for file in files] == [".png", ".pdf"]
     with Image.open(files[0]) as picture:
         assert picture.width > 1000 and picture.height > 400

@@ -26,6 +26,7 @@ from lp_framework.commands.building import (
     warn_of_unused,
     weights_fingerprint,
 )
+from lp_framework.commands.eval_pictures import save_pictures
 from lp_framework.commands.finished import is_finished, unfinished_evaluation
 from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairData
@@ -38,7 +39,6 @@ from lp_framework.models.checkpoints import find_checkpoint
 from lp_framework.solvers.base import Solver
 from lp_framework.solvers.starts import Starts
 from lp_framework.viz.html.run_page import write_run_page
-from lp_framework.viz.pictures import save_pictures, save_summaries
 
 LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and many would be long unsaved
 LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 starts, 18 from 2
@@ -57,6 +57,8 @@ def run(config: DictConfig) -> None:
     settings = plain(config)
     if settings["trainer"].get("precision", "32-true") != "32-true":
         raise UserError("trainer.precision: poses are computed in float32; prior.dtype=bfloat16 is Zero123's own")
+    if not isinstance(settings["pictures"], bool):
+        raise UserError(f"pictures must be true or false, got {settings['pictures']}")
     seed_run(settings["seed"])
     components = Components(settings, checkpoint)
     takes_model = "model" in components.needs("solver")
@@ -119,11 +121,11 @@ def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
 
 
 def write_all(folder: Path, result: dict[str, Any], evaluation: Evaluation, views: PairData, journal: Journal) -> None:
-    """Results, pictures and page, once the results are those of all processes."""
-    save = save_summaries if isinstance(evaluation, ViewSetEvaluation) else save_pictures
+    """Results, and pictures and page unless they are not wanted, once the results are those of all processes."""
     write_result(folder, result, evaluation.metrics, evaluation.table)
     journal.finish()
-    print_results(folder, result, save(folder / "pictures", evaluation, views))
+    wanted = result["config"]["pictures"]
+    print_results(folder, result, save_pictures(folder / "pictures", evaluation, views) if wanted else [])
 
 
 def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]) -> None:
@@ -139,6 +141,7 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
     if result["unanswered"]:
         console.print(f"no answer for {result['unanswered']:.1%} of the pairs")
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)
-    names = ", ".join(picture.name for picture in pictures)
-    console.print(f"pictures: {folder / 'pictures'} ({names})", soft_wrap=True)
-    console.print(f"page:     {write_run_page(folder, 'eval')}", soft_wrap=True)
+    if pictures:
+        names = ", ".join(picture.name for picture in pictures)
+        console.print(f"pictures: {folder / 'pictures'} ({names})", soft_wrap=True)
+        console.print(f"page:     {write_run_page(folder, 'eval')}", soft_wrap=True)

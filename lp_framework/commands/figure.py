@@ -28,7 +28,7 @@ def run(config: DictConfig) -> None:
         components["data"].prepare_data()
     for part in figure.networks():
         part.to(device)
-    contents = figure.gather(config.seed, device)
+    contents = figure.analyse(config.seed, device)
     files = save_figure(figure.draw(contents), folder / f"figure_{name}")
     record = {
         "files": [file.name for file in files],

@@ -4,35 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
-from lp_framework.commands import pair_landscape
-from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
+from lp_framework.analysis.azimuth import NEAR_DEGREES
+from lp_framework.analysis.examples import EXAMPLES, save_examples
+from lp_framework.analysis.fields import Draws
+from lp_framework.analysis.landscapes import Grid, landscape_grid
+from lp_framework.analysis.overview import overview
+from lp_framework.analysis.pairs import ExplainedPair, explained_pair, named_pairs
+from lp_framework.analysis.shown import ShownPair, View, words
+from lp_framework.api import move, view_set
+from lp_framework.commands.building import (
+    Components,
+    orderly_console,
+    plain,
+    run_folder,
+    seed_run,
+    versions,
+    warn_of_photographs,
+)
 from lp_framework.commands.device import choose_device
-from lp_framework.data.cache import tracked
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.pairs import ViewTable
+from lp_framework.data.photographs import on_white, photograph_files, prepared_photographs
 from lp_framework.errors import UserError
-from lp_framework.evaluation.ambiguity import Ambiguity, ambiguity
-from lp_framework.evaluation.azimuth import NEAR_DEGREES, Profile, azimuth_energies, profile, within
-from lp_framework.evaluation.landscape import Landscape, landscape_grid, prior_landscapes
-from lp_framework.evaluation.tables import write_json
-from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import pairs_of
+from lp_framework.evaluation.tables import write_arrays, write_json
+from lp_framework.geometry import wrap_angle
+from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.azimuth import AzimuthPanel, azimuth_figure
 from lp_framework.viz.html.run_page import write_run_page
+from lp_framework.viz.maps import field_figure, pair_figure
 from lp_framework.viz.style import save_figure
+from lp_framework.viz.surface import surface_figure
 
-PAIRS = 8  # an object, for its ambiguity
 OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview has no use for
 
 
@@ -43,10 +58,14 @@ def run(config: DictConfig) -> None:
     check(config)
     folder = run_folder()
     seed_run(config.seed)
-    if config.object is not None or config.images is not None:
-        pair_landscape.run(config, folder)
+    grid = landscape_grid(config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees)
+    draws = Draws(list(config.timesteps), config.noises, config.seed, config.batch)
+    device = choose_device(config.accelerator)
+    components = Components(plain(config))
+    if config.object is None and config.images is None:
+        run_overview(config, components, folder, device, draws, grid)
     else:
-        overview(config, folder)
+        run_pair(config, components, folder, device, draws, grid)
 
 
 def check(config: DictConfig) -> None:
@@ -69,107 +88,203 @@ def check(config: DictConfig) -> None:
         raise UserError("give object=NAME for views of the data set or images=[A.png,B.png], not both")
 
 
-def overview(config: DictConfig, folder: Path) -> None:
+# ---------------------------------------------------------------- a pair
+
+
+def run_pair(
+    config: DictConfig, components: Components, folder: Path, device: torch.device, draws: Draws, grid: Grid
+) -> None:
+    """Write `landscape.npz`, `landscape.json` and the pictures `landscape`, `surface` and `fields`; print the minima.
+
+    Of photographs, whose truth is not known, the slice is at relative radius 0, and there are no fields.
+    """
+    if config.images is not None:
+        pairs, pair = photographs(config, device)
+    else:
+        pairs, pair = data_pair(config, components["data"], device)
+    solver, prior = components["solver"], components["prior"].to(device)
+    move(solver, device)
+    model = None if pair.truth is None else components["model"].to(device)
+    starts = components["start"].make(pairs, config.seed)
+    with shown_progress():
+        found = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
+
+    pair, method = found.pair, words(config.solver.name)
+    write_arrays(folder / "landscape.npz", landscape_arrays(found))
+    checkpoint = None if components.checkpoint is None else str(components.checkpoint)
+    record = {"checkpoint": checkpoint, "seed": config.seed, "config": plain(config), "versions": versions()}
+    write_json(folder / "landscape.json", {**summary(pair), **record})
+    heading = f"Energy of prior {config.prior.name}, ways of {method}"
+    figures = {
+        "landscape": pair_figure(pair, found.views, pair.object, energy_note(pair, draws), heading),
+        "surface": surface_figure(pair.prior_energy, pair.truth, pair.object),
+    }
+    if pair.maps:
+        note = "ways of the first stage without noise (langevin, gamma 0)"
+        figures["fields"] = field_figure(pair, pair.object, note)
+    pictures = [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
+    example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
+    save_examples(folder / "pictures" / EXAMPLES, [example])
+    console = Console(width=None if Console().is_terminal else 110, highlight=False)
+    console.print(pair_table(f"{pair.object}, prior={config.prior.name}", method, pair))
+    console.print(f"results:  {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
+    console.print(f"pictures: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True)
+    console.print(f"page:     {write_run_page(folder, 'landscape')}", soft_wrap=True)
+
+
+def data_pair(config: DictConfig, data: PairDataModule, device: torch.device) -> tuple[Pairs, ShownPair]:
+    """Two test views of the data set's `object`."""
+    for key in ("reference", "query"):
+        if not isinstance(config[key], int):
+            raise UserError(f"{key} must be the number of a test view, got {config[key]}")
+    data.evaluate_on("ordered", config.seed)
+    data.prepare_data()
+    pairs, (pair,) = named_pairs(data, [str(config.object)], [(config.reference, config.query)], device)
+    title = f"{pair.title} ({pair.ambiguity}), views {config.reference} and {config.query}"
+    return pairs, replace(pair, object=title)
+
+
+def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownPair]:
+    """The two files of `images`, prepared as `estimate` prepares them, with its reference camera."""
+    files = photograph_files(config.images)
+    if len(files) != 2:
+        raise UserError(f"images: a landscape is of two files, got {len(files)}")
+    prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
+    warn_of_photographs(plain(config.prior))
+    pairs = view_set(prepared, device).pairs([0], [1])
+    pose = np.array([0.0, 0.0, 1.4])
+    reference, query = (View(file, on_white(image), pose) for file, image in zip(files, prepared, strict=True))
+    return pairs, ShownPair(f"{reference.name} and {query.name}", "unlabelled", "", reference, query)
+
+
+def landscape_arrays(found: ExplainedPair) -> dict[str, Any]:
+    """What goes into `landscape.npz`: radians and scene units."""
+    pair, landscape = found.pair, found.pair.prior_energy
+    arrays = {
+        "latitude": landscape.latitude.numpy(), "longitude": landscape.longitude.numpy(),
+        "radius": np.float32(landscape.radius), "energy": landscape.energy.numpy(),
+        "trajectories": pair.ends[:, None] if pair.trajectories is None else pair.trajectories, "truth": pair.truth,
+    }  # fmt: skip
+    if found.field is not None:
+        score, energy = found.field
+        arrays |= {
+            "model_score": score[0].cpu().numpy(),
+            "model_energy": None if energy is None else energy[0].cpu().numpy(),
+        }
+    return {name: each for name, each in arrays.items() if each is not None}
+
+
+def energy_note(pair: ShownPair, draws: Draws) -> str:
+    """How many minima the landscape has, and what its energy is the mean of."""
+    count, radius = len(pair.prior_energy.minima()), f"{pair.prior_energy.radius:+.2f}".replace("-", "\u2212")
+    return (
+        f"{count} local {'minimum' if count == 1 else 'minima'} at the "
+        f"{'' if pair.truth is None else 'true '}relative radius {radius}; mean of "
+        f"{len(draws.steps())} noises at timesteps {', '.join(map(str, draws.timesteps))}"
+    )
+
+
+def summary(pair: ShownPair) -> dict[str, Any]:
+    """The content of `landscape.json`; angles in degrees."""
+    truth, landscape = pair.truth, pair.prior_energy
+    errors = [None] * len(pair.ends) if truth is None else pair.rotation_errors.tolist()
+    return {
+        "reference": str(pair.reference.file),
+        "query": str(pair.query.file),
+        "truth": None if truth is None else in_degrees(truth),
+        "radius": landscape.radius,
+        "minima": [
+            {**minimum._asdict(), "latitude": math.degrees(minimum.latitude),
+             "longitude": math.degrees(minimum.longitude)} for minimum in landscape.minima()
+        ],
+        "flatness": landscape.flatness(),
+        "descents": [
+            {"start_longitude": start, "end": in_degrees(end), "rotation_error": error, "energy": energy,
+             "chosen": number == pair.chosen}
+            for number, (start, end, error, energy) in enumerate(
+                zip(start_longitudes(pair), pair.ends, errors, pair.energies.tolist(), strict=True)
+            )
+        ],
+    }  # fmt: skip
+
+
+def start_longitudes(pair: ShownPair) -> list[float] | list[None]:
+    """Longitudes of the starts, degrees in [0, 360); None for each end of a solver that makes its own."""
+    if pair.starts is None:
+        return [None] * len(pair.ends)
+    degrees: list[float] = (torch.from_numpy(pair.starts[:, 1]).rad2deg() % 360).tolist()
+    return degrees
+
+
+def in_degrees(pose: NDArray) -> tuple[float, float, float]:
+    """A relative pose `[3]` as degrees, degrees in [0, 360), scene units."""
+    latitude, longitude, radius = pose.tolist()
+    return math.degrees(latitude), math.degrees(longitude) % 360, radius
+
+
+def pair_table(title: str, method: str, pair: ShownPair) -> Table:
+    """The truth, the minima and the ends."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in ("", "latitude", "longitude", "height", "prominence", "from the truth"):
+        table.add_column(column, justify="right" if column else "left", no_wrap=True)
+
+    def add(name: str, latitude: float, longitude: float, *cells: str) -> None:
+        table.add_row(name, f"{latitude:.0f}°", f"{longitude:.0f}°", *cells)
+
+    if pair.truth is not None:
+        add("truth", *in_degrees(pair.truth)[:2])
+    for number, minimum in enumerate(pair.prior_energy.minima(), start=1):
+        away = ""
+        if pair.truth is not None:
+            offset = wrap_angle(torch.tensor(minimum.longitude - float(pair.truth[1]))).abs().item()
+            away = f"{math.degrees(offset):.0f}° in longitude"
+        place = math.degrees(minimum.latitude), math.degrees(minimum.longitude)
+        add(f"minimum {number}", *place, f"{minimum.height:.2f}", f"{minimum.prominence:.2f}", away)
+    table.add_section()
+    ends = zip(start_longitudes(pair), pair.ends, pair.rotation_errors, strict=True)
+    for number, (start, end, error) in enumerate(ends):
+        mark = " (answer)" if number == pair.chosen else ""
+        off = "" if pair.truth is None else f"{error:.0f}°{mark}"
+        add(method if start is None else f"{method} from {start:.0f}°", *in_degrees(end)[:2], "", "", off)
+    return table
+
+
+# ---------------------------------------------------------------- all objects
+
+
+def run_overview(
+    config: DictConfig, components: Components, folder: Path, device: torch.device, draws: Draws, grid: Grid
+) -> None:
     """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
-    grid = landscape_grid(config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees)
-    device = choose_device(config.accelerator)
-    components = Components(plain(config))
-    prior: Prior = components["prior"].to(device)
-    data = components["data"]
+    prior, data = components["prior"].to(device), components["data"]
     data.evaluate_on(config.protocol, config.seed)
     data.prepare_data()
-    table = data.table(data.evaluation_split())
-    azimuths = torch.arange(config.azimuths) * (2 * math.pi / config.azimuths)
-    energies, truth, objects = [], [], []
-    for batch in tracked(list(data.test_dataloader()), "energies around the objects"):
-        pairs = pairs_of(batch, table, device)
-        poses = batch.relative_poses()
-        energies.append(
-            azimuth_energies(
-                prior, pairs, poses.to(device), azimuths, config.timesteps, config.noises, config.seed, config.batch
-            ).cpu()
-        )
-        truth.append(poses[:, 1])
-        objects.append(batch.objects[batch.reference])
-    rows = summarise(table, torch.cat(energies), azimuths, torch.cat(truth), torch.cat(objects))
-    for row, score in zip(rows, ambiguities(config, data, prior, grid, device), strict=True):
-        row["ambiguity_score"] = score.record()
-    record = {"objects": rows, **overall(rows), "config": plain(config), "versions": versions()}
-    write_json(folder / "azimuth.json", record)
+    record = overview(data, prior, device, draws, grid, config.azimuths)
+    write_json(folder / "azimuth.json", {**record, "config": plain(config), "versions": versions()})
+    rows = record["objects"]
     panels = [
-        AzimuthPanel(row["object"], row["ambiguity"], row["degrees"], row["energy"], row["within"]) for row in rows
+        AzimuthPanel(*(row[key] for key in ("object", "ambiguity", "degrees", "energy", "within"))) for row in rows
     ]
-    pictures = save_figure(azimuth_figure(panels), folder / "azimuth")
+    picture, _ = save_figure(azimuth_figure(panels), folder / "azimuth")
     console = Console(width=None if Console().is_terminal else 110, highlight=False)
-    console.print(terminal_table(f"{config.data.name}, prior={config.prior.name}", rows, record))
+    console.print(overview_table(f"{config.data.name}, prior={config.prior.name}", record))
     if unanswered := [row["object"] for row in rows if not row["ambiguity_score"]["unique_answer"]]:
         console.print(f"without a unique answer to this prior: {', '.join(unanswered)}", soft_wrap=True)
     console.print(f"results: {folder / 'azimuth.json'}", soft_wrap=True)
-    console.print(f"picture: {pictures[0]}", soft_wrap=True)
+    console.print(f"picture: {picture}", soft_wrap=True)
     console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
 
 
-def ambiguities(
-    config: DictConfig, data: PairDataModule, prior: Prior, grid: tuple[Tensor, Tensor], device: torch.device
-) -> list[Ambiguity]:
-    """The ambiguity of every object, by the landscapes of up to `PAIRS` pairs of the protocol `per_view`."""
-    split = data.evaluation_split()
-    table, batches = data.table(split), data.data(split)
-    pairs = table.pairs("per_view", config.seed)  # a row a view
-    found = []
-    for index in tracked(range(len(table.names)), "ambiguity of the objects"):
-        batch = batches[pairs[table.views_of(index)[:PAIRS]]]
-        own = pairs_of(batch, table, device)
-        truth = batch.relative_poses()
-        energies = prior_landscapes(
-            prior, own, truth[:, 2], *grid, config.timesteps, config.noises, config.seed, config.batch
-        ).cpu()
-        radii = truth[:, 2].tolist()
-        found.append(ambiguity([Landscape(*grid, *each) for each in zip(radii, energies, strict=True)], truth[:, 1]))
-    return found
-
-
-def summarise(
-    table: ViewTable, energies: Tensor, azimuths: Tensor, truth: Tensor, objects: Tensor
-) -> list[dict[str, Any]]:
-    """A row an object: its share of pairs `within` the limit, its profile and the minima of that."""
-    near = within(energies, azimuths, truth)
-    rows = []
-    for index, name in enumerate(table.names):
-        mask = objects == index
-        curve: Profile = profile(energies[mask], azimuths, truth[mask])
-        rows.append(
-            {
-                "object": name, "ambiguity": table.ambiguities[index], "unique_answer": table.unique_answer[index],
-                "pairs": int(mask.sum()), "within": near[mask].double().mean().item(),
-                "relief": curve.relief, "minima": [minimum._asdict() for minimum in curve.minima()],
-                "degrees": curve.degrees.tolist(), "energy": curve.energy.tolist(),
-            }
-        )  # fmt: skip
-    return rows
-
-
-def overall(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """The share of pairs within the limit, over all objects and over those with a unique answer."""
-
-    def share(chosen: list[dict[str, Any]]) -> float | None:
-        pairs = sum(row["pairs"] for row in chosen)
-        return sum(row["within"] * row["pairs"] for row in chosen) / pairs if pairs else None
-
-    return {"within": share(rows), "within_unique_answer": share([row for row in rows if row["unique_answer"]])}
-
-
-def terminal_table(title: str, rows: list[dict[str, Any]], record: dict[str, Any]) -> Table:
+def overview_table(title: str, record: dict[str, Any]) -> Table:
     """A row an object, then the shares over all of them."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("object", no_wrap=True)
-    table.add_column("class", no_wrap=True)
-    table.add_column(f"within {NEAR_DEGREES:g}°", justify="right")
-    table.add_column("relief", justify="right")
-    table.add_column("minima (degrees from truth: height)", no_wrap=True)
-    table.add_column("flatness", justify="right", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    for row in sorted(rows, key=lambda row: -row["within"]):
+    for column in (
+        "object", "class", f"within {NEAR_DEGREES:g}°", "relief", "minima (degrees from truth: height)", "flatness",
+        "verdict",
+    ):  # fmt: skip
+        numbers = column in ("relief", "flatness") or column.startswith("within")
+        table.add_column(column, justify="right" if numbers else "left", no_wrap=True)
+    for row in sorted(record["objects"], key=lambda row: -row["within"]):
         minima = ", ".join(f"{minimum['degrees']:+.0f}: {minimum['height']:.2f}" for minimum in row["minima"][:4])
         score = row["ambiguity_score"]
         table.add_row(

@@ -45,7 +45,7 @@ from lp_framework.models.checkpoints import BEST, FOLDER, LAST, KeepRecipe, read
 from lp_framework.models.model_folder import RECIPE
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.viz.html.run_page import write_run_page
-from lp_framework.viz.pictures import save_training_picture
+from lp_framework.viz.training import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
 OF_TRAINING = ("batch_pairs", "block", "validation_views", "seed")  # settings of data that an evaluation has no use for

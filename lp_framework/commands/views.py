@@ -8,21 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from omegaconf import DictConfig
 from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
+from lp_framework.analysis.generated import generated_views
 from lp_framework.api import image_batch
 from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
-from lp_framework.data.cache import tracked
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
+from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.style import save_figure
 from lp_framework.viz.views import views_figure
 
@@ -53,16 +53,14 @@ def run(config: DictConfig) -> None:
 
     poses = grid(latitudes, longitudes)  # [rows, columns, 3]
     code = prior.encode(image_batch([source.image]).to(device))
-    columns = []
-    for column in tracked(range(len(longitudes)), "views around the object"):
-        pose = poses[:, column].to(device)
-        generator = torch.Generator().manual_seed(config.seed)  # all views' draws; on the CPU: a GPU gets the same
-        repeated = code[torch.zeros(len(pose), dtype=torch.int64, device=device)]
-        images = prior.generate(repeated, pose, config.steps, config.guidance, generator, config.eta)
-        columns.append(pixels(images))
-        for row, view in enumerate(columns[-1]):
-            save_png(folder / FOLDER / file_name(latitudes[row], longitudes[column]), Image.fromarray(view))
-    views = np.stack(columns, axis=1)  # [rows, columns, h, w, 3]
+    sampling = (config.steps, config.guidance, config.seed, config.eta)
+    with shown_progress():  # a column at once
+        images = generated_views(prior, code, poses.transpose(0, 1).flatten(0, 1), *sampling, batch=len(latitudes))
+    views = np.rint(255 * images).astype(np.uint8).reshape(len(longitudes), len(latitudes), *images.shape[1:])
+    views = views.swapaxes(0, 1)  # [rows, columns, h, w, 3]
+    for row, latitude in enumerate(latitudes):
+        for column, longitude in enumerate(longitudes):
+            save_png(folder / FOLDER / file_name(latitude, longitude), Image.fromarray(views[row, column]))
 
     settings = f"steps {config.steps}, guidance {config.guidance:g}, eta {config.eta:g}, seed {config.seed}"
     figure = views_figure(
@@ -129,11 +127,6 @@ def data_view(config: DictConfig, data: PairDataModule) -> Source:
     index = table.names.index(config.object)
     file = table.files[table.views_of(index)[0]]
     return Source(file, table.names[index].replace("_", " "), prepare(read_image(file), str(file), crop=False))
-
-
-def pixels(images: Tensor) -> NDArray[np.uint8]:
-    """Pixels `[B, H, W, 3]` of images `[B, 3, H, W]` in [-1, 1]."""
-    return ((images + 1) * 127.5).round().clamp(0, 255).byte().permute(0, 2, 3, 1).cpu().numpy()
 
 
 def file_name(latitude: float, longitude: float) -> str:

@@ -28,7 +28,8 @@ log = logging.getLogger(__name__)
 
 FOLDER = "unfinished"
 SUBJECT = "evaluation.json"
-MOVABLE = ("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy")  # may change on the way
+# What may change on the way.
+MOVABLE = ("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy", "pictures")
 WHOLE_NUMBERS = ("pair", "object", "chosen")
 DECIMALS = ("rotation", "translation", "answer")
 

@@ -8,21 +8,22 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from lp_framework import registry
+from lp_framework.analysis.azimuth import NEAR_DEGREES
+from lp_framework.analysis.pairs import named_pairs, object_index, solved_pairs
+from lp_framework.analysis.shown import ShownPair, words
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import read_image
 from lp_framework.errors import UserError
-from lp_framework.figures.base import PaperFigure
-from lp_framework.figures.models import score_model
-from lp_framework.figures.shown_pairs import object_index, shown_pairs, words
-from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error
+from lp_framework.figures.base import PaperFigure, score_model
+from lp_framework.geometry import apply_relative_pose
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.progress import shown_progress
-from lp_framework.viz.camera_methods import CameraScene, camera_methods_figure
+from lp_framework.viz.cameras import CameraScene, camera_methods_figure
 
-NEAR_DEGREES = 15.0
 NAMES = {"ifusion": "iFusion", "id_pose": "ID-Pose", "two_stage": "two-stage"}  # as papers write them
 
 
@@ -62,43 +63,34 @@ class CamerasFigure(PaperFigure[CameraContents]):
         self.solvers = {name: registry.build("solver", name, prior=prior, model=self.model) for name in methods}
         self.starts = registry.build("start", {"name": "random", "count": starts})
 
-    def gather(self, seed: int, device: torch.device) -> CameraContents:
+    def analyse(self, seed: int, device: torch.device) -> CameraContents:
         """All objects and views are solved together, a method after the other."""
-        table = self.data.table("test")
-        fewest = min(len(table.objects[object_index(self.data, name)]) for name in self.objects)
-        targets = max(1, min(self.targets, fewest - 1))
+        views = [self.data.table("test").objects[object_index(self.data, name)] for name in self.objects]
+        targets = max(1, min(self.targets, *(len(each) - 1 for each in views)))
         objects = [name for name in self.objects for _ in range(targets)]
-        shown = shown_pairs(self.data, objects, [(0, k + 1) for k in range(targets)] * len(self.objects), device)
-        starts = self.starts.make(shown.pairs, seed)
-        reference, query = (shown.poses[:, side, None] for side in (0, 1))
-        predicted, near = [], []
-        for name in self.methods:
-            with shown_progress():
-                solution = self.solvers[name].solve(shown.pairs, starts, seed)
-            poses = apply_relative_pose(reference, solution.poses.detach().cpu().double())
-            error = rotation_error(camera_to_world(poses), camera_to_world(query).expand(*poses.shape[:2], 4, 4))
-            predicted.append(poses.unflatten(0, (len(self.objects), targets)).numpy())
-            near.append((error <= NEAR_DEGREES).unflatten(0, (len(self.objects), targets)).flatten(1))
+        pairs, shown = named_pairs(self.data, objects, [(0, k + 1) for k in range(targets)] * len(views), device)
+        starts = self.starts.make(pairs, seed)
+        with shown_progress():
+            solved = [solved_pairs(pairs, shown, self.solvers[name], starts, seed) for name in self.methods]
         scenes = []
-        for number, name in enumerate(self.objects):
+        for number, each in enumerate(views):
             own = slice(number * targets, (number + 1) * targets)
-            views = table.objects[object_index(self.data, name)]
+            first, methods = shown[own][0], [pairs[own] for pairs in solved]
+            errors = [np.concatenate([pair.rotation_errors for pair in method]) for method in methods]
             scenes.append(
                 CameraScene(
-                    words(name),
-                    np.concatenate([shown.images[own][:1, 0], shown.images[own, 1]]),
-                    views.poses[: targets + 1].numpy(),
-                    np.asarray(read_image(views.files[0]).convert("RGBA")),
-                    [poses[number] for poses in predicted],
-                    [
-                        f"{int(each[number].sum())} of {each.shape[1]} within {NEAR_DEGREES:g}°" for each in near
-                    ],
+                    first.title,
+                    np.stack([first.reference.image, *(pair.query.image for pair in shown[own])]),
+                    each.poses[: targets + 1].numpy(),
+                    np.asarray(read_image(each.files[0]).convert("RGBA")),
+                    [np.stack([predicted(pair) for pair in method]) for method in methods],
+                    [f"{(near <= NEAR_DEGREES).sum()} of {len(near)} within {NEAR_DEGREES:g}°" for near in errors],
                 )
-            )  # fmt: skip
-        return CameraContents(scenes, [NAMES.get(name, words(name)) for name in self.methods], views.field_of_view)
+            )
+        return CameraContents(scenes, [NAMES.get(name, words(name)) for name in self.methods], views[-1].field_of_view)
 
     def draw(self, contents: CameraContents) -> Figure:
-        """See `viz.camera_methods`."""
+        """See `viz.cameras`."""
         return camera_methods_figure(*contents)
 
     def caption(self, contents: CameraContents) -> str:
@@ -109,3 +101,9 @@ class CamerasFigure(PaperFigure[CameraContents]):
             f"({names}), relative to the reference (red), from {self.starts.count} random starts for each view: "
             f"{' and '.join(contents.methods)}. Counted are the predictions within {NEAR_DEGREES:g} degrees."
         )
+
+
+def predicted(pair: ShownPair) -> NDArray:
+    """The query's view poses `[N, 3]` that a solver predicts."""
+    poses = apply_relative_pose(torch.from_numpy(pair.reference.pose), torch.from_numpy(pair.ends).double())
+    return np.asarray(poses)

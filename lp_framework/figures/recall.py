@@ -28,7 +28,7 @@ class RecallFigure(PaperFigure[SweepTable]):
     def __init__(self, runs: str = "runs/multirun/eval/starts", objects: Objects = "unique_answer") -> None:
         self.runs, self.objects = runs, objects
 
-    def gather(self, seed: int, device: torch.device) -> SweepTable:
+    def analyse(self, seed: int, device: torch.device) -> SweepTable:
         """The table of the experiment; nothing is drawn at random."""
         make = f"`python -m lp_framework eval experiment={EXPERIMENT}` makes them"
         if not Path(self.runs).is_dir():

@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 
 import torch
 from matplotlib.figure import Figure
 
+from lp_framework.analysis.fields import ExactModel, field_error, model_arrows, model_field
+from lp_framework.analysis.landscapes import Landscape, PoseMap, landscape_grid
+from lp_framework.analysis.pairs import named_pairs, object_index, truths
+from lp_framework.analysis.shown import ShownPair
 from lp_framework.data.module import PairDataModule
-from lp_framework.errors import UserError
-from lp_framework.evaluation.landscape import landscape_grid, model_landscape
-from lp_framework.figures.base import PaperFigure
-from lp_framework.figures.model_fields import density, field_error, model_grid
-from lp_framework.figures.models import energy_model, score_model
-from lp_framework.figures.shown_pairs import ShownPairs, object_index, shown_pairs, words
+from lp_framework.figures.base import PaperFigure, checked_objects, energy_model, score_model
+from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
-from lp_framework.viz.fields import longest
-from lp_framework.viz.pictures import ExactModel
-from lp_framework.viz.score_panels import ComparisonRow, FieldPanel, comparison_figure
+from lp_framework.viz.panels import comparison_figure
+
+SPACING = 20.0  # degrees, of arrows
 
 
 @register("figure", "score_vs_energy")
-class ScoreVsEnergyFigure(PaperFigure[list[ComparisonRow]]):
+class ScoreVsEnergyFigure(PaperFigure[list[ShownPair]]):
     """Density and score field of an energy model beside the field of a score model, for a pair of each object.
 
     The pairs are two test views, by number. `score` and `energy` are training runs or checkpoints; None for the score
@@ -38,49 +39,43 @@ class ScoreVsEnergyFigure(PaperFigure[list[ComparisonRow]]):
         score: str | None = None,
         energy: str | None = None,
     ) -> None:
-        if not objects:
-            raise UserError("figure.objects needs the name of an object")
-        self.data, self.objects, self.places = data, list(objects), (reference, query)
+        self.data, self.objects, self.places = data, checked_objects(objects), [(reference, query)] * len(objects)
         self.energy, self.score = energy_model(energy), score_model(score)
 
-    def gather(self, seed: int, device: torch.device) -> list[ComparisonRow]:
-        """All at the pairs' true relative radii; nothing is drawn at random."""
-        shown = shown_pairs(self.data, self.objects, [self.places] * len(self.objects), device)
-        latitude, longitude = landscape_grid()
-        energies = model_landscape(self.energy, shown.pairs, shown.truth[:, 2], latitude, longitude).energy
+    def analyse(self, seed: int, device: torch.device) -> list[ShownPair]:
+        """Three maps a pair, at its true relative radius; nothing is drawn at random."""
+        pairs, shown = named_pairs(self.data, self.objects, self.places, device)
+        truth, grid = truths(shown), landscape_grid()
+        radius = truth[:, 2]
+        energies = model_field(self.energy, pairs, radius, grid).energy
         assert energies is not None
-        rows = []
-        for number, name in enumerate(self.objects):
-            truth = shown.truth[number]
-            exact = model_grid(ExactModel(self.score.kernel, truth), shown.pairs, truth)
-            all_pairs = self._all_pairs(name, device)
-            panels = [
-                FieldPanel(
-                    f"error {field_error(model, all_pairs.pairs, all_pairs.truth):.1%}",
-                    model_grid(model, shown.pairs, truth, number),
-                    longest(exact),
-                )
-                for model in (self.energy, self.score)
-            ]
-            reference, query = shown.images[number]
-            rows.append(
-                ComparisonRow(
-                    words(name), reference, query, truth.numpy(),
-                    density(energies[number], latitude, longitude, truth), *panels,
-                )
-            )  # fmt: skip
-        return rows
+        exact, *learned = (
+            model_arrows(model, pairs, radius, SPACING)
+            for model in (ExactModel(self.score.kernel, truth), self.energy, self.score)
+        )
+        found = []
+        for number, pair in enumerate(shown):
+            density = Landscape(*grid, radius[number].item(), energies[number].cpu()).density()
+            maps = [PoseMap(density=density)]
+            for model, arrows in zip((self.energy, self.score), learned, strict=True):
+                own = arrows[number]._replace(scale=exact[number].longest())
+                maps.append(PoseMap(f"error {self._error(model, pair.object, device):.1%}", arrows=own))
+            found.append(replace(pair, maps=maps))
+        return found
 
-    def _all_pairs(self, name: str, device: torch.device) -> ShownPairs:
-        """All ordered pairs of an object's test views."""
-        places = list(permutations(range(len(self.data.table("test").views_of(object_index(self.data, name)))), 2))
-        return shown_pairs(self.data, [name] * len(places), places, device)
+    def _error(self, model: PoseModel, name: str, device: torch.device) -> float:
+        """A model's error over all ordered pairs of an object's test views."""
+        count = len(self.data.table("test").objects[object_index(self.data, name)])
+        places = list(permutations(range(count), 2))
+        pairs, shown = named_pairs(self.data, [name] * len(places), places, device)
+        return field_error(model, pairs, truths(shown), SPACING)
 
-    def draw(self, contents: list[ComparisonRow]) -> Figure:
-        """See `viz.score_panels`."""
-        return comparison_figure(contents)
+    def draw(self, contents: list[ShownPair]) -> Figure:
+        """See `viz.panels`."""
+        titles = ("energy model, exp(\u2212E)", "energy model, \u2212\u2207E", "score model")
+        return comparison_figure(contents, titles)
 
-    def caption(self, contents: list[ComparisonRow]) -> str:
+    def caption(self, contents: list[ShownPair]) -> str:
         """See `PaperFigure`."""
         return (
             "(a) Reference above query; (b) exp(-E) of the energy model over its greatest; (c) minus the gradient of "

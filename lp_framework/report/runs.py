@@ -181,7 +181,7 @@ def _is_left_aside(key: str) -> bool:
     """Whether a key is not compared: seeds, plugin folders, what changes no result, and the checkpoint, which has
     `checkpoint_setting`.
     """
-    return key in ("plugins", "checkpoint", "seed", "batch_pairs", "resume") or key.endswith(".seed")
+    return key in ("plugins", "checkpoint", "seed", "batch_pairs", "pictures", "resume") or key.endswith(".seed")
 
 
 def _number(value: Any) -> Any:

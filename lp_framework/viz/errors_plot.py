@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,10 +16,11 @@ from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter, StrMe
 from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLD
-from lp_framework.viz.style import CLASS_COLOURS, FAINT, INK, MUTED, open_frame, place_axes, show_image, styled
+from lp_framework.viz.style import CLASS_COLOURS, FAINT, INK, MUTED, Sheet, key, open_frame, shortened, styled
 
 MOST_OBJECTS = 42  # on a contact sheet
 NEAREST = 0.01  # scene units; where the logarithmic axis of translation errors begins
+DASHED: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (3, 2)), "zorder": 2}
 
 
 def cumulative(errors: NDArray, end: float) -> tuple[NDArray, NDArray]:
@@ -52,20 +54,18 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
         colour = CLASS_COLOURS[name]
         for axes, errors, end in ((left, rotation, 180.0), (right, translation, 4.0)):
             answer = np.take_along_axis(errors[rows], chosen[rows, None], axis=1)
-            axes.plot(*cumulative(answer.ravel(), end), color=colour, drawstyle="steps-post", label=name, zorder=3)
+            stairs = {"color": colour, "drawstyle": "steps-post"}
+            axes.plot(*cumulative(answer.ravel(), end), label=name, zorder=3, **stairs)
             if several:
-                axes.plot(
-                    *cumulative(errors[rows].ravel(), end), color=colour, drawstyle="steps-post", linewidth=1.0,
-                    linestyle=(0, (3, 2)), label=f"{name}, all starts", zorder=2,
-                )  # fmt: skip
+                axes.plot(*cumulative(errors[rows].ravel(), end), label=f"{name}, all starts", **stairs, **DASHED)
         keys.append(Line2D([], [], color=colour, label=f"{name} ({rows.sum()} pairs)"))
     if several:
-        keys += [
-            Line2D([], [], color=INK, label="chosen start"),
-            Line2D([], [], color=INK, linewidth=1.0, linestyle=(0, (3, 2)), label=f"all {rotation.shape[1]} starts"),
-        ]
+        keys.append(Line2D([], [], color=INK, label="chosen start"))
+        keys.append(Line2D([], [], color=INK, label=f"all {rotation.shape[1]} starts", **DASHED))
     # Small errors matter most: a square-root axis gives them room and still begins at 0.
-    left.set_xscale("function", functions=(_signed_root, _signed_square))
+    left.set_xscale(
+        "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * np.square(x))
+    )
     left.set(xlim=(0, 180), ylim=(0, 1.005), ylabel="share of pairs within the error")
     left.xaxis.set_major_locator(FixedLocator([0, *ROTATION_THRESHOLDS, 60, 90, 120, 180]))
     left.xaxis.set_minor_locator(NullLocator())
@@ -83,14 +83,6 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
             axes.axvline(threshold, color=MUTED, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
     figure.legend(handles=keys, loc="outside upper left", ncols=len(keys), columnspacing=1.6, handlelength=1.8)
     return figure
-
-
-def _signed_root(x: NDArray) -> NDArray:
-    return np.sign(x) * np.sqrt(np.abs(x))
-
-
-def _signed_square(x: NDArray) -> NDArray:
-    return np.sign(x) * np.square(x)
 
 
 @dataclass(frozen=True)
@@ -111,40 +103,29 @@ def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
     shown = ranked[:MOST_OBJECTS]
     columns = min(len(shown), 4 if len(shown) <= 8 else 6 if len(shown) <= 18 else 7)
     rows = math.ceil(len(shown) / columns)
-    card, text, top, gap = (8.0 - 0.1) / columns, 0.62, 0.38, 0.12  # inches
-    card = min(card, 1.6)
-    height = top + rows * (card - gap + text)
-    figure = Figure(figsize=(8.0, height))
+    card, text, top, gap = min((8.0 - 0.1) / columns, 1.6), 0.62, 0.38, 0.12  # inches
+    side = card - gap
+    sheet = Sheet(8.0, top + rows * (side + text))
+    left_out = len(ranked) - len(shown)
+    sheet.head("Objects, worst first" + (f" (the {len(shown)} worst of {len(ranked)})" if left_out else ""))
     for index, each in enumerate(shown):
         row, column = divmod(index, columns)
-        left, upper = 0.1 + column * card, height - top - row * (card - gap + text)
-        side = card - gap
-        axes = place_axes(figure, left, upper - side, side, side)
-        show_image(axes, each.image, "")
-        below = place_axes(figure, left, upper - side - text, side, text)
-        _write_card(below, each, side)
-    left_out = len(ranked) - len(shown)
-    title = "Objects, worst first" + (f" (the {len(shown)} worst of {len(ranked)})" if left_out else "")
-    figure.text(0.1 / 8.0, 1 - 0.08 / height, title, fontsize=10, fontweight="bold", va="top")
+        x, y = 0.1 + column * card, top + row * (side + text)
+        sheet.image(x, y, side, each.image)
+        _write_card(sheet.axes(x, y + side, side, text), each, side)
     present = {each.ambiguity for each in shown}
     keys = [
-        Line2D([], [], linestyle="none", marker="s", markersize=5, color=colour, label=name)
-        for name, colour in CLASS_COLOURS.items()
-        if name in present
+        key(name, marker="s", markersize=5, color=colour) for name, colour in CLASS_COLOURS.items() if name in present
     ]
-    figure.legend(
-        handles=keys, loc="upper right", bbox_to_anchor=(1 - 0.1 / 8.0, 1 - 0.08 / height), ncols=len(keys),
-        columnspacing=1.2, handletextpad=0.2, borderaxespad=0.0, borderpad=0.0,
-    )  # fmt: skip
-    return figure
+    sheet.legend(keys, 7.9, 0.08, columnspacing=1.2, handletextpad=0.2)
+    return sheet.figure
 
 
 def _write_card(axes: Axes, card: ObjectCard, side: float) -> None:
     """Name and class, then a bar and a number for each of the two shares; one data unit is an inch."""
     axes.set(xlim=(0, side), ylim=(0.62, 0))
     axes.axis("off")
-    name, room = card.name.replace("_", " "), int(14.5 * side)  # about as many letters fit
-    name = name if len(name) <= room else name[: room - 1] + "…"
+    name = shortened(card.name.replace("_", " "), 14.5 * side)
     axes.text(0, 0.1, name, va="center", fontsize=7.5, fontweight="bold")
     axes.plot([side - 0.04], [0.1], marker="s", markersize=5, color=CLASS_COLOURS[card.ambiguity], clip_on=False)
     left, width = 0.5, side - 0.5 - 0.28

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, ParamSpec
 
@@ -11,6 +11,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MultipleLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from lp_framework.atomic import written
 # Okabe and Ito's palette, which the common kinds of colour blindness keep apart.
 BLUE, ORANGE, PURPLE, GREEN, VERMILION = "#0072B2", "#E69F00", "#CC79A7", "#009E73", "#D55E00"
 INK, MUTED, FAINT = "#222222", "#6B6B6B", "#D4D4D4"
+ASIDE: Any = {"color": MUTED, "fontsize": 7.5}
 
 CLASS_COLOURS = {"unique": BLUE, "twofold": ORANGE, "continuous": PURPLE, "unlabelled": MUTED}
 TRUTH, ANSWER, OTHERS = "#FFC20A", VERMILION, "#3A3A3A"
@@ -83,16 +85,53 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
     return files
 
 
-def place_axes(figure: Figure, x: float, y: float, wide: float, tall: float) -> Axes:
-    """Axes in a box of the figure (inches from the lower left)."""
-    width, height = figure.get_size_inches()
-    return figure.add_axes((x / width, y / height, wide / width, tall / height))
+class Sheet:
+    """A figure that is laid out in inches, from its upper left corner."""
 
+    def __init__(self, width: float, height: float) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width, height))
 
-def write(figure: Figure, x: float, y: float, text: str) -> None:
-    """A panel's title above a place in the figure (inches from the lower left)."""
-    width, height = figure.get_size_inches()
-    figure.text(x / width, (y + 0.05) / height, text, fontsize=8.5)
+    def axes(self, x: float, y: float, wide: float, tall: float, **settings: Any) -> Any:
+        """Axes (of matplotlib) in a box whose upper left corner is at (x, y)."""
+        box = (x / self.width, 1 - (y + tall) / self.height, wide / self.width, tall / self.height)
+        return self.figure.add_axes(box, **settings)
+
+    def image(self, x: float, y: float, side: float, image: NDArray, title: str = "", **frame: Any) -> Axes:
+        """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame, a title above it."""
+        axes = self.axes(x, y, side, side)
+        axes.imshow(image, interpolation="antialiased")
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set(**{"color": FAINT, "linewidth": 0.8, **frame})
+        if title:
+            axes.set_title(title, color=MUTED, pad=3)
+        return axes
+
+    def text(self, x: float, y: float, text: str, **style: Any) -> None:
+        """Text at a place; it stands on it unless the style says otherwise."""
+        self.figure.text(x / self.width, 1 - y / self.height, text, **style)
+
+    def head(self, title: str, note: str = "") -> None:
+        """The title of the whole, and a note below it."""
+        self.text(0.1, 0.1, title, fontsize=10, fontweight="bold", va="top")
+        self.text(0.1, 0.3, note, color=MUTED, va="top")
+
+    def above(self, x: float, y: float, text: str, **style: Any) -> None:
+        """A line above a place, by default the title of a panel."""
+        self.text(x, y - 0.05, text, **{"fontsize": 8.5, **style})
+
+    def legend(self, keys: Sequence[Line2D], x: float, y: float, **style: Any) -> None:
+        """A key in one row, its upper right corner at (x, y)."""
+        place = (x / self.width, 1 - y / self.height)
+        layout = {"ncols": len(keys), "columnspacing": 1.3, "handletextpad": 0.3, "handlelength": 1.4}
+        self.figure.legend(
+            handles=keys,
+            loc="upper right",
+            bbox_to_anchor=place,
+            borderaxespad=0.0,
+            borderpad=0.0,
+            **{**layout, **style},
+        )
 
 
 def degrees(axes: Axes, which: Literal["x", "y"], step: float) -> None:
@@ -108,10 +147,16 @@ def open_frame(axes: Axes) -> None:
     axes.grid(color=FAINT, linewidth=0.4)
 
 
-def show_image(axes: Axes, image: NDArray, title: str) -> None:
-    """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame."""
-    axes.imshow(image, interpolation="antialiased")
-    axes.set(xticks=[], yticks=[])
-    axes.spines[:].set(color=FAINT, linewidth=0.8)
-    if title:
-        axes.set_title(title, color=MUTED, pad=3)
+def key(label: str, **style: Any) -> Line2D:
+    """An entry of a key; a mark unless the style says otherwise."""
+    return Line2D([], [], label=label, **{"linestyle": "none", **style})
+
+
+def letter(number: int, title: str) -> str:
+    """The title of a panel by its number: (a), (b), ..."""
+    return f"({chr(ord('a') + number)}) {title}"
+
+
+def shortened(name: str, room: float) -> str:
+    """A name that fits into so many letters."""
+    return name if len(name) <= int(room) else name[: int(room) - 1] + "…"

@@ -13,7 +13,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
-from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, VERMILION, open_frame, styled
+from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, VERMILION, open_frame, save_figure, styled
 
 LOSSES = {"train/loss": (BLUE, "training loss"), "val/loss": (VERMILION, "validation loss"),
           "train/view_loss": (GREEN, "training, view readout")}  # fmt: skip
@@ -35,6 +35,17 @@ def read_curves(path: Path) -> dict[str, Curve]:
                 if name != "step" and cell:
                     gathered.setdefault(name, []).append((float(row["step"]), float(cell)))
     return {name: Curve(*np.array(points).T) for name, points in gathered.items()}
+
+
+def save_training_picture(folder: Path) -> list[Path]:
+    """`training.png` and `.pdf` in a training run's folder, from its `metrics.csv`; none where nothing was logged."""
+    metrics = folder / "metrics.csv"
+    curves = read_curves(metrics) if metrics.is_file() else {}
+    losses = {name: curves[name] for name in LOSSES if name in curves}
+    if not losses:
+        return []
+    rate = next((curve for name, curve in curves.items() if name.startswith("lr-")), None)
+    return save_figure(training_figure(losses, rate), folder / "training")[:1]
 
 
 def running_mean(values: NDArray, window: int) -> NDArray:

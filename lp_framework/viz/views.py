@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from lp_framework.viz.style import FAINT, MUTED, TRUTH, place_axes, show_image, styled
+from lp_framework.viz.style import FAINT, TRUTH, Sheet, styled
 
 # Inches: the figure's width, margins, the room for the latitudes, and the sides of the source and of the largest view.
 WIDTH, SIDE, TOP, BOTTOM, LABELS, SOURCE, LARGEST = 10.0, 0.1, 0.74, 0.42, 0.62, 1.8, 1.6
@@ -34,11 +34,10 @@ def views_figure(
     cell = min((WIDTH - left - SIDE) / columns, LARGEST)
     wide, high = cell * columns, cell * rows
     tall = max(high, SOURCE)
-    width, height = left + wide + SIDE, TOP + tall + BOTTOM
-    figure = Figure(figsize=(width, height))
-
-    show_image(place_axes(figure, SIDE, BOTTOM + tall - SOURCE, SOURCE, SOURCE), source, "source")
-    axes = place_axes(figure, left, BOTTOM + tall - high, wide, high)
+    sheet = Sheet(left + wide + SIDE, TOP + tall + BOTTOM)
+    sheet.head(title, note)
+    sheet.image(SIDE, TOP, SOURCE, source, "source")
+    axes = sheet.axes(left, TOP, wide, high)
     # Data coordinates are those of cells: the centre of row r and column c is (c, r).
     axes.imshow(
         contact_sheet(views), interpolation="antialiased", extent=(-0.5, columns - 0.5, rows - 0.5, -0.5), aspect="auto"
@@ -50,16 +49,14 @@ def views_figure(
     axes.spines[:].set_visible(False)
     axes.vlines(np.arange(1, columns) - 0.5, -0.5, rows - 0.5, color=FAINT, linewidth=0.5)
     axes.hlines(np.arange(1, rows) - 0.5, -0.5, columns - 0.5, color=FAINT, linewidth=0.5)
-    axes.add_patch(Rectangle((-0.5, -0.5), columns, rows, fill=False, edgecolor=FAINT, linewidth=0.8, clip_on=False))
+    frames = [((-0.5, -0.5), columns, rows, FAINT, 0.8)]
     own = np.isclose(np.asarray(latitudes_degrees)[:, None], 0) & np.isclose(np.asarray(longitudes_degrees) % 360, 0)
-    for row, column in np.argwhere(own):
-        corner = (column - 0.5, row - 0.5)
-        axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor=TRUTH, linewidth=1.6, clip_on=False, zorder=3))
+    frames += [((column - 0.5, row - 0.5), 1, 1, TRUTH, 1.6) for row, column in np.argwhere(own)]
+    for *box, colour, thick in frames:
+        axes.add_patch(Rectangle(*box, fill=False, edgecolor=colour, linewidth=thick, clip_on=False, zorder=2 + thick))
     axes.set_xlabel("longitude relative to the source")
     axes.set_ylabel("latitude")
-    figure.text(SIDE / width, 1 - 0.1 / height, title, fontsize=10, fontweight="bold", va="top")
-    figure.text(SIDE / width, 1 - 0.3 / height, note, color=MUTED, va="top")
-    return figure
+    return sheet.figure
 
 
 def contact_sheet(views: NDArray) -> NDArray:

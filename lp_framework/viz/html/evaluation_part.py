@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from lp_framework.analysis.examples import EXAMPLES, read_examples
 from lp_framework.errors import UserError
-from lp_framework.evaluation.examples import EXAMPLES, read_examples
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS, summary_rows
 from lp_framework.report.printed_tables import HEADINGS, number

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lp_framework.analysis.examples import EXAMPLES, read_examples
 from lp_framework.errors import UserError
-from lp_framework.evaluation.examples import EXAMPLES, read_examples
 from lp_framework.viz.html.elements import Cell, Html, joined, sentence, sheet, sparkline, table
 from lp_framework.viz.html.page import Data
 from lp_framework.viz.html.parts import BROKEN, RunPart, configuration, guarded, read_json

@@ -7,7 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from lp_framework.evaluation.examples import Example, as_json
+from lp_framework.analysis.examples import as_json
+from lp_framework.analysis.shown import ShownPair
 from lp_framework.viz.html.elements import Html, joined, picture, sentence, tag
 from lp_framework.viz.html.page import Data
 from lp_framework.viz.style import CLASS_COLOURS
@@ -19,7 +20,7 @@ LEGEND = {
 }  # fmt: skip
 
 
-def viewer(examples: Sequence[Example], data: Data) -> Html:
+def viewer(examples: Sequence[ShownPair], data: Data) -> Html:
     """The cards of `examples`, the first one chosen, and what the page's script plays."""
     if not examples:
         return sentence("No pairs were kept.")
@@ -87,7 +88,7 @@ def class_of(ambiguity: str) -> Html:
     return tag("span", {"class": f"class {known}"}, ambiguity)
 
 
-def _content(example: Example) -> dict[str, Any]:
+def _content(example: ShownPair) -> dict[str, Any]:
     """What the script draws: the example, and the valleys of its landscapes."""
     content = as_json(example)
     for each, landscape in zip(content["landscapes"], example.landscapes.values(), strict=True):
@@ -95,7 +96,7 @@ def _content(example: Example) -> dict[str, Any]:
     return content
 
 
-def _card(example: Example) -> Html:
+def _card(example: ShownPair) -> Html:
     name = example.object.replace("_", " ")
     error = example.rotation_errors[example.chosen]
     images = [

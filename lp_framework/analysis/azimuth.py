@@ -7,13 +7,13 @@ second valley at half a turn: the shape looks the same from behind. No valley: n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lp_framework.evaluation.landscape import BATCH, pose_energies
+from lp_framework.analysis.fields import Draws, pose_energies
+from lp_framework.analysis.landscapes import valleys
 from lp_framework.geometry import wrap_angle
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs
@@ -22,23 +22,14 @@ NEAR_DEGREES = 15.0
 PROMINENCE = 0.1  # of the profile's range; a shallower dent is no minimum
 
 
-def azimuth_energies(
-    prior: Prior,
-    pairs: Pairs,
-    poses: Tensor,
-    azimuths: Tensor,
-    timesteps: Sequence[int],
-    noises: int,
-    seed: int,
-    batch: int = BATCH,
-) -> Tensor:
+def azimuth_energies(prior: Prior, pairs: Pairs, poses: Tensor, azimuths: Tensor, draws: Draws) -> Tensor:
     """Energies `[B, A]` at the relative longitudes `azimuths` `[A]` (radians), for B pairs of true `poses` `[B, 3]`.
 
     As `prior_landscapes`, but latitude and radius are the true ones.
     """
     around = poses[:, None].repeat(1, len(azimuths), 1)
     around[..., 1] = azimuths.to(poses)
-    return pose_energies(prior, pairs, around, timesteps, noises, seed, batch)
+    return pose_energies(prior, pairs, around, draws)
 
 
 class Minimum(NamedTuple):
@@ -61,26 +52,10 @@ class Profile(NamedTuple):
 
     def minima(self) -> list[Minimum]:
         """Its local minima, the deepest first; a dent of less than `PROMINENCE` of the range does not count."""
-        energy, degrees = self.energy.tolist(), self.degrees.tolist()
-        count, low, high = len(energy), min(energy), max(energy)
-        depth = high - low or 1.0
-        found = []
-        for place, value in enumerate(energy):
-            if not (value < energy[place - 1] and value <= energy[(place + 1) % count]):  # the first of equal ones
-                continue
-            # The pass to lower ground on either side; of the deepest minimum, the highest point there is.
-            passes = []
-            for step in (-1, 1):
-                highest = value
-                for far in range(1, count):
-                    other = energy[(place + step * far) % count]
-                    if other < value:
-                        passes.append(highest)
-                        break
-                    highest = max(highest, other)
-            if (min(passes) if passes else high) - value >= PROMINENCE * depth:
-                found.append(Minimum(degrees[place], (value - low) / depth))
-        return sorted(found, key=lambda minimum: minimum.height)
+        return [
+            Minimum(self.degrees[valley.cell].item(), valley.height)
+            for valley in valleys(self.energy[None], PROMINENCE)
+        ]
 
 
 def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:

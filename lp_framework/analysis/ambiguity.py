@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from lp_framework.evaluation.azimuth import Profile, profile
-from lp_framework.evaluation.landscape import FLAT, Landscape
+from lp_framework.analysis.azimuth import Profile, profile
+from lp_framework.analysis.landscapes import FLAT, Landscape
 
 EQUAL = 0.05  # of the floor's range; valleys whose depths differ by less are equally good answers
 HALF_TURN = 30.0  # degrees; so far from 180 a second valley may lie to be one of the other side

@@ -1,0 +1,169 @@
+"""Energies and scores over relative poses: of a prior, of a model, and of the kernel that a model learns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from lp_framework.analysis.landscapes import Arrows, Grid, Landscape, cell_grid
+from lp_framework.models.objectives import PoseKernel
+from lp_framework.models.pose_model import FieldValue, PoseModel
+from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.pair_energy import PairEnergy
+from lp_framework.solvers.progress import steps_of
+
+GRADIENT_BATCH = 8  # poses whose gradients are taken at once
+
+
+class Draws(NamedTuple):
+    """Over what a prior's energy is the mean: `noises` at each of `timesteps`, keyed by `seed`, in both directions.
+
+    The noises are the same at all poses. No more than `batch` poses pass the prior at once, two samples each.
+    """
+
+    timesteps: Sequence[int]
+    noises: int
+    seed: int
+    batch: int = 64
+
+    def steps(self) -> list[int]:
+        """The timestep of every noise."""
+        return [timestep for timestep in self.timesteps for _ in range(self.noises)]
+
+    def in_words(self) -> str:
+        """A sentence for captions.
+
+        >>> Draws([100, 900], 5, seed=0).in_words()
+        'Mean over both directions of the pair, timesteps 100, 900 and 5 noises at each.'
+        """
+        each = "one noise" if self.noises == 1 else f"{self.noises} noises"
+        steps = ", ".join(map(str, self.timesteps))
+        return f"Mean over both directions of the pair, timesteps {steps} and {each} at each."
+
+
+class PoseField(Protocol):
+    """What is asked of a model of the pose, see `PoseModel`."""
+
+    def encode(self, images: Tensor) -> Tensor: ...
+
+    def condition(self, reference: Tensor, query: Tensor) -> Tensor: ...
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue: ...
+
+
+class ExactModel(nn.Module):
+    """Stands in for a model of P pairs: the kernel's own score around their truths `[P, 3]`, the best to be learnt."""
+
+    def __init__(self, kernel: PoseKernel, truth: Tensor, has_energy: bool = False) -> None:
+        super().__init__()
+        self.kernel, self.truth, self.has_energy = kernel, truth, has_energy
+
+    def encode(self, images: Tensor) -> Tensor:
+        """No features are needed: `[I, 1]`."""
+        return images.new_zeros(len(images), 1)
+
+    def condition(self, reference: Tensor, query: Tensor) -> Tensor:
+        """See `PoseModel`."""
+        return reference
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        """See `PoseModel`; poses are `[P, ..., 3]`."""
+        truth = self.truth.view(-1, *[1] * (pose.ndim - 2), 3).to(pose)
+        energy = self.kernel.energy(pose, truth) if self.has_energy else None
+        return FieldValue(self.kernel.score(pose, truth), energy)
+
+
+def grid_poses(radius: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
+    """Relative poses `[B, A, O, 3]`, float32, at relative radii `[B]`, on their device."""
+    angles = torch.cartesian_prod(latitude.float(), longitude.float()).view(len(latitude), len(longitude), 2)
+    angles = angles.to(radius.device).expand(len(radius), -1, -1, -1)
+    radii = radius.float()[:, None, None, None].expand(*angles.shape[:3], 1)
+    return torch.cat([angles, radii], dim=-1)
+
+
+# ---------------------------------------------------------------- priors
+
+
+@torch.no_grad()
+def prior_landscapes(prior: Prior, pairs: Pairs, radius: Tensor, grid: Grid, draws: Draws) -> list[Landscape]:
+    """A prior's energy over a grid of latitudes and longitudes for B pairs, each at its relative radius of `[B]`."""
+    poses = grid_poses(radius.to(pairs.images.device), *grid)
+    energies = pose_energies(prior, pairs, poses.flatten(1, 2), draws).view(poses.shape[:3]).cpu()
+    return [Landscape(*grid, *each) for each in zip(radius.tolist(), energies, strict=True)]
+
+
+@torch.no_grad()
+def pose_energies(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Tensor:
+    """A prior's energies `[B, N]` of relative poses `[B, N, 3]`; a bar shows the progress inside `shown_progress`."""
+    steps, codes = draws.steps(), prior.encode(pairs.images)
+    # Several pairs at once, or some poses of one pair.
+    groups = torch.arange(len(pairs), device=poses.device).split(max(1, draws.batch // poses.shape[1]))
+    parts = torch.arange(poses.shape[1], device=poses.device).split(draws.batch)
+    tasks = [(group, part) for group in groups for part in parts]
+    energies = poses.new_empty(poses.shape[:2])
+    for number in steps_of(len(tasks), "landscape"):
+        group, part = tasks[number]
+        some = Pairs(pairs.images, pairs.reference[group], pairs.query[group], pairs.ids[group])
+        energy = PairEnergy(prior, some, draws.seed, codes)
+        place = group[:, None], part
+        energies[place] = energy.mean(poses[place], steps, energy.noise(0, count=len(steps)))
+    return energies
+
+
+def prior_field(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> FieldValue:
+    """A prior's field at relative poses `[B, N, 3]`: minus the gradient of `pose_energies`, and these energies."""
+    energy, steps = PairEnergy(prior, pairs, draws.seed), draws.steps()
+    noise = energy.noise(0, count=len(steps))
+    parts = poses.split(max(1, min(draws.batch, GRADIENT_BATCH) // len(pairs)), dim=1)
+    scores, energies = [], []
+    for number in steps_of(len(parts), "gradients of the landscape"):
+        variable = parts[number].detach().clone().requires_grad_()
+        gradient = torch.zeros_like(variable)
+        total = torch.zeros(variable.shape[:2], device=variable.device)
+        for place, timestep in enumerate(steps):  # a graph of one at a time is kept
+            with torch.enable_grad():
+                value = energy(variable, timestep, noise[:, place])
+                gradient += torch.autograd.grad(value.sum(), variable)[0]
+            total += value.detach()
+        scores.append(-gradient / len(steps))
+        energies.append(total / len(steps))
+    return FieldValue(torch.cat(scores, dim=1), torch.cat(energies, dim=1))
+
+
+# ---------------------------------------------------------------- models
+
+
+@torch.no_grad()
+def model_field(model: PoseField, pairs: Pairs, radius: Tensor, grid: Grid) -> FieldValue:
+    """A model's scores `[B, A, O, 3]` and, of an energy model, energies `[B, A, O]`, at relative radii `[B]`."""
+    features = model.encode(pairs.images)
+    condition = model.condition(features[pairs.reference], features[pairs.query])[:, None, None]
+    return model.field(condition, grid_poses(radius.to(pairs.images.device), *grid))
+
+
+def model_arrows(model: PoseField, pairs: Pairs, radius: Tensor, spacing: float) -> list[Arrows]:
+    """A model's scores for B pairs on `cell_grid`, at relative radii `[B]`."""
+    grid = cell_grid(spacing)
+    return arrows(grid, model_field(model, pairs, radius, grid).score)
+
+
+def arrows(grid: Grid, scores: Tensor) -> list[Arrows]:
+    """Scores `[B, A, O, 3]` on a grid of latitudes and longitudes, as arrays."""
+    latitude, longitude = (each.rad2deg().numpy() for each in grid)
+    return [Arrows(latitude, longitude, score) for score in scores.detach().cpu().numpy()]
+
+
+def field_error(model: PoseModel, pairs: Pairs, truth: Tensor, spacing: float) -> float:
+    """How far a model's scores are from the exact ones, at the arrows of B pairs with true relative poses `[B, 3]`.
+
+    The root of the mean squared distance over that of the mean squared exact score; radii are the true ones.
+    """
+    exact, learned = (
+        model_field(each, pairs, truth[:, 2], cell_grid(spacing)).score
+        for each in (ExactModel(model.kernel, truth), model)
+    )
+    return float(((learned - exact).square().sum() / exact.square().sum()).sqrt())

@@ -1,0 +1,217 @@
+"""Landscapes over relative latitude and longitude as plain arrays, their valleys, and what is mapped beside them.
+
+The paper's Figures 1 and 2 (appendix, Additional Zero123 MSE Landscape Visualization): why a start ends in the wrong
+valley. What fills the arrays is in `fields`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lp_framework.errors import UserError
+
+FLAT = 0.9  # a valley floor of which no more than a tenth of the range is relief tells nothing of the longitude
+PROMINENCE = 0.05  # of the landscape's range; a shallower dent is no minimum
+
+
+Grid = tuple[Tensor, Tensor]  # relative latitudes `[A]` and longitudes `[O]`, radians
+
+
+class LandscapeMinimum(NamedTuple):
+    """A valley's bottom: its place (radians, between the grid's points), and the energy at the nearest of those.
+
+    `height` is where that lies in the landscape's range, from 0 to 1. `prominence` is the climb from there to the
+    lowest pass into deeper ground, in units of the range; of the deepest minimum it is 1.
+    """
+
+    latitude: float
+    longitude: float
+    energy: float
+    height: float
+    prominence: float
+
+
+class Landscape(NamedTuple):
+    """Energies `[A, O]` of one pair at relative latitudes `[A]` and longitudes `[O]` (radians), and one `radius`.
+
+    Latitudes ascend; longitudes are evenly spaced over the whole turn, from 0 up. The radius is relative, in scene
+    units.
+    """
+
+    latitude: Tensor
+    longitude: Tensor
+    radius: float
+    energy: Tensor
+
+    def minima(self) -> list[LandscapeMinimum]:
+        """Its local minima, the deepest first; see `valleys`. Places are refined by a parabola along either angle."""
+        return [
+            LandscapeMinimum(*self._place(valley.cell), self.energy.flatten()[valley.cell].item(), *valley[1:])
+            for valley in valleys(self.energy, PROMINENCE)
+        ]
+
+    def floor(self) -> Tensor:
+        """The lowest ground at each longitude `[O]`, in the landscape's range from 0 to 1; all 0 without relief."""
+        low, high = self.energy.min(), self.energy.max()
+        return (self.energy.min(dim=0).values - low) / torch.where(high > low, high - low, 1.0)
+
+    def flatness(self) -> float:
+        """How little the longitude tells: 1 where a valley of one depth runs all around, 0 where a wall blocks it."""
+        return 1 - self.floor().max().item()
+
+    def density(self) -> Landscape:
+        """exp(-E) over its greatest, in the place of the energy."""
+        return self._replace(energy=(self.energy.min() - self.energy).exp())
+
+    def _place(self, cell: int) -> tuple[float, float]:
+        """Latitude and longitude (radians) of the bottom of the parabolas through a minimum and its neighbours."""
+        rows, columns = self.energy.shape
+        row, column = divmod(cell, columns)
+        latitude, longitude = self.latitude[row].item(), self.longitude[column].item()
+        if 0 < row < rows - 1:
+            step = (self.latitude[row + 1] - self.latitude[row - 1]).item() / 2
+            latitude += step * _vertex(*self.energy[row - 1 : row + 2, column].tolist())
+        sides = [(column - 1) % columns, column, (column + 1) % columns]
+        longitude += 2 * math.pi / columns * _vertex(*self.energy[row, sides].tolist())
+        return latitude, longitude % (2 * math.pi)
+
+
+def _vertex(left: float, middle: float, right: float) -> float:
+    """Where the parabola through three values at -1, 0, 1 is least, at most half a step away; 0 where it is flat."""
+    curvature = left - 2 * middle + right
+    return min(max((left - right) / (2 * curvature), -0.5), 0.5) if curvature > 0 else 0.0
+
+
+class Valley(NamedTuple):
+    """The lowest point of a valley, by its number in the flattened grid; the rest as of a `LandscapeMinimum`."""
+
+    cell: int
+    height: float
+    prominence: float
+
+
+def valleys(energy: Tensor, least: float) -> list[Valley]:
+    """The valleys of energies `[A, O]` whose prominence is `least` or more, the deepest first.
+
+    On a cylinder: periodic in longitude, open in latitude, so the lowest ground on a border is a valley as well (its
+    bottom may lie beyond). A point has eight neighbours. Equal energies side by side are one minimum, saddles are none,
+    energies that are not finite are passed over, and without relief there is no valley.
+    """
+    rows, columns = energy.shape
+    heights = energy.double().flatten().tolist()
+    ascending = sorted((cell for cell, value in enumerate(heights) if math.isfinite(value)), key=heights.__getitem__)
+    if not ascending or heights[ascending[0]] == heights[ascending[-1]]:
+        return []
+    low, relief = heights[ascending[0]], heights[ascending[-1]] - heights[ascending[0]]
+    basin: dict[int, int] = {}  # of a flooded point a point of the same basin, and at last the basin's bottom
+    climbs: dict[int, float] = {}  # from a basin's bottom to the pass where it meets a deeper one
+
+    def bottom(cell: int) -> int:
+        while basin[cell] != cell:
+            basin[cell] = basin[basin[cell]]
+            cell = basin[cell]
+        return cell
+
+    # The points are flooded from below: one without flooded neighbours begins a basin, one between basins is a pass.
+    for cell in ascending:
+        row, column = divmod(cell, columns)
+        around = [
+            near * columns + (column + step) % columns
+            for near in range(max(0, row - 1), min(rows, row + 2))
+            for step in (-1, 0, 1)
+        ]
+        met = sorted({bottom(each) for each in around if each in basin}, key=heights.__getitem__)
+        basin[cell] = met[0] if met else cell
+        if not met:
+            climbs[cell] = relief
+        for shallower in met[1:]:
+            basin[shallower] = met[0]
+            climbs[shallower] = heights[cell] - heights[shallower]
+    found = [Valley(cell, (heights[cell] - low) / relief, climb / relief) for cell, climb in climbs.items()]
+    return sorted((valley for valley in found if valley.prominence >= least), key=lambda valley: heights[valley.cell])
+
+
+def landscape_grid(latitude_limit: float = 60.0, latitude_step: float = 8.0, longitude_step: float = 12.0) -> Grid:
+    """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) of a landscape, of steps in degrees.
+
+    Latitudes go from minus `latitude_limit` up; the defaults are the paper's 16 x 30. `UserError` where the longitudes
+    would not be even over the turn.
+
+    >>> [len(each) for each in landscape_grid()]
+    [16, 30]
+    """
+    if not 0 < latitude_limit < 180 or not 0 < latitude_step <= latitude_limit:
+        raise UserError(
+            f"latitudes need a limit between 0 and 180 degrees and a step up to it, got {latitude_limit} by "
+            f"{latitude_step}"
+        )
+    count = round(360 / longitude_step) if 0 < longitude_step <= 120 else 0
+    if count < 3 or abs(count * longitude_step - 360) > 1e-6:
+        raise UserError(f"longitude_step_degrees must divide 360 into three or more, got {longitude_step}")
+    rows = math.floor(2 * latitude_limit / latitude_step + 1e-9) + 1
+    latitude = torch.arange(rows, dtype=torch.float64) * latitude_step - latitude_limit
+    longitude = torch.arange(count, dtype=torch.float64) * (360 / count)
+    return latitude.deg2rad().float(), longitude.deg2rad().float()
+
+
+def cell_grid(spacing: float, limit: float = 60.0) -> Grid:
+    """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) at the centres of cells, for arrows.
+
+    The cells, of about `spacing` degrees, fill longitudes 0..360 and latitudes -`limit`..`limit` (degrees).
+
+    >>> torch.rad2deg(cell_grid(60.0)[0])
+    tensor([-30.0000,  30.0000])
+    """
+    rows, columns = max(1, round(2 * limit / spacing)), max(1, round(360 / spacing))
+    latitude = (torch.arange(rows, dtype=torch.float64) + 0.5) * (2 * limit / rows) - limit
+    longitude = (torch.arange(columns, dtype=torch.float64) + 0.5) * (360 / columns)
+    return latitude.deg2rad().float(), longitude.deg2rad().float()
+
+
+class Arrows(NamedTuple):
+    """A score field on `cell_grid`: `latitude` `[A]` and `longitude` `[O]` in degrees, `score` `[A, O, 3]` (latitude,
+    longitude, radius; radians, scene units). The longest arrow stands for a score of length `scale`, None: of its own.
+    """
+
+    latitude: NDArray
+    longitude: NDArray
+    score: NDArray
+    scale: float | None = None
+
+    def lengths(self) -> NDArray:
+        """Length of the score in the plane of the map, `[A, O]`."""
+        return np.hypot(self.score[..., 0], self.score[..., 1])
+
+    def longest(self) -> float:
+        """The greatest length in the plane of the map, 0 for a field of nothing."""
+        return float(np.nan_to_num(self.lengths(), posinf=0.0).max())
+
+
+class Ways(NamedTuple):
+    """What a solver did from N starts, as relative poses in radians and scene units: final poses `ends` `[N, 3]`, the
+    index of the answer `chosen`, and where known `starts` `[N, 3]` and `paths` `[N, S, 3]` (longitudes unreduced).
+    """
+
+    ends: NDArray
+    chosen: int | None = None
+    starts: NDArray | None = None
+    paths: NDArray | None = None
+
+
+class PoseMap(NamedTuple):
+    """A map of relative latitude and longitude: its title and what is on it, from the ground up.
+
+    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; the `ways` of a solver.
+    """
+
+    title: str = ""
+    relief: Landscape | None = None
+    density: Landscape | None = None
+    arrows: Arrows | None = None
+    ways: Ways | None = None

@@ -1,0 +1,265 @@
+"""Pairs that are shown: which views they are, and all that explains what a solver does with them.
+
+Each function takes pairs in two forms, on a device for networks (`Pairs`) and as arrays (`ShownPair`, one a pair), and
+returns the arrays with more in them.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lp_framework.analysis.fields import Draws, ExactModel, model_arrows, model_field, prior_landscapes
+from lp_framework.analysis.generated import generated_views
+from lp_framework.analysis.landscapes import Grid, Landscape, PoseMap, Ways, landscape_grid
+from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.pairs import PairData
+from lp_framework.errors import UserError, nearest
+from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error
+from lp_framework.models.pose_model import FieldValue, PoseModel
+from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs, Solution, Solver, pairs_of
+from lp_framework.solvers.langevin import Langevin
+
+ARROW_SPACING = 12.0  # degrees
+SAMPLING = (50, 3.0)  # steps and guidance of DDIM, for what the prior generates at the ends
+DENSITY_GRID = landscape_grid(60.0, 4.0, 6.0)
+
+
+# ---------------------------------------------------------------- which pairs
+
+
+def shown_pairs(
+    data: PairData, views: NDArray[np.int64], device: torch.device, reasons: Sequence[str] | None = None
+) -> tuple[Pairs, list[ShownPair]]:
+    """P pairs of views (reference, query) by their numbers `[P, 2]` in the data's table; on a device, and as arrays."""
+    table, batch, images = data.table, data[views], data.images
+    assert images is not None  # nothing that is shown caches features
+    shown = []
+    for place, pair in enumerate(views):
+        index = int(table.object_of_view[pair[0]])
+        reference, query = (
+            View(table.files[view], np.asarray(images[view]), table.poses[view].numpy()) for view in pair
+        )
+        reason = "" if reasons is None else reasons[place]
+        truth = batch.relative_poses()[place].numpy()
+        shown.append(ShownPair(table.names[index], table.ambiguities[index], reason, reference, query, truth))
+    return pairs_of(batch, table, device), shown
+
+
+def named_pairs(
+    data: PairDataModule, objects: Sequence[str], places: Sequence[tuple[int, int]], device: torch.device
+) -> tuple[Pairs, list[ShownPair]]:
+    """Pairs of test views (reference, query), numbered from 0 within their object; see `shown_pairs`.
+
+    `UserError` for an object that the data do not have, and for a view that it does not have.
+    """
+    table = data.table("test")
+    chosen = []
+    for name, pair in zip(objects, places, strict=True):
+        views = table.views_of(object_index(data, name))
+        for place, what in zip(pair, ("reference", "query"), strict=True):
+            if not 0 <= place < len(views):
+                raise UserError(f"object '{name}' has test views 0 to {len(views) - 1}, there is no {what} {place}")
+        if pair[0] == pair[1]:
+            raise UserError(f"reference and query must be two views, got {pair[0]} for both")
+        chosen.append([views[place] for place in pair])
+    return shown_pairs(data.data("test"), np.array(chosen), device)
+
+
+def object_index(data: PairDataModule, name: str) -> int:
+    """The place of an object in the table of test views; `UserError` where there is none of that name."""
+    names = data.table("test").names
+    if name not in names:
+        raise UserError(f"the data have no object '{name}'{nearest(name, names)} (known: {', '.join(names)})")
+    return names.index(name)
+
+
+def truths(shown: Sequence[ShownPair]) -> Tensor:
+    """The true relative poses `[P, 3]`, float32."""
+    return torch.from_numpy(np.stack([pair.truth for pair in shown if pair.truth is not None])).float()
+
+
+# ---------------------------------------------------------------- what a solver does
+
+
+def solved_pairs(
+    pairs: Pairs, shown: Sequence[ShownPair], solver: Solver, starts: Tensor, seed: int
+) -> list[ShownPair]:
+    """The pairs with what a solver did from starts `[P, N, 3]`, its trajectories too; all are solved at once."""
+    solution = recording(solver).solve(pairs, starts, seed)
+    return [with_solution(pair, solution, starts, place) for place, pair in enumerate(shown)]
+
+
+def with_solution(pair: ShownPair, solution: Solution, starts: Tensor, place: int) -> ShownPair:
+    """The pair with the solution's problem number `place`.
+
+    A solver whose answers are not as many as the starts has made candidates of its own: the pair shows no starts.
+    """
+    ends = _array(solution.poses[place])
+    errors = np.full(len(ends), np.nan)
+    if pair.truth is not None:
+        reference = torch.from_numpy(pair.reference.pose)
+        cameras = [
+            camera_to_world(apply_relative_pose(reference, torch.from_numpy(pose).double()))
+            for pose in (ends, pair.truth)
+        ]
+        errors = rotation_error(*cameras).numpy()
+    return replace(
+        pair,
+        starts=_array(starts[place]) if solution.poses.shape == starts.shape else None,
+        trajectories=None if solution.trajectory is None else _array(solution.trajectory[place]),
+        ends=ends,
+        energies=_array(solution.energies[place]),
+        chosen=int(solution.chosen[place]),
+        rotation_errors=errors,
+        translation_errors=np.full(len(ends), np.nan),
+    )
+
+
+def recording(solver: Solver) -> Solver:
+    """The solver and those that it is made of, told to keep their trajectories where they have a setting of that name.
+
+    It is a copy, so the given one stays as it is.
+    """
+    solver = copy.copy(solver)
+    for name, part in vars(solver).items():
+        if isinstance(part, Solver):
+            vars(solver)[name] = recording(part)
+    if isinstance(getattr(solver, "trajectory", None), bool):
+        vars(solver)["trajectory"] = True
+    return solver
+
+
+# ---------------------------------------------------------------- what explains it
+
+
+def with_prior_energy(
+    pairs: Pairs, shown: Sequence[ShownPair], prior: Prior, draws: Draws, grid: Grid | None = None
+) -> list[ShownPair]:
+    """The pairs with the prior's landscape, on the paper's grid unless given, at the true relative radii or at 0."""
+    radius = torch.tensor([0.0 if pair.truth is None else float(pair.truth[2]) for pair in shown])
+    found = prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws)
+    return [with_landscape(pair, PRIOR_ENERGY, landscape) for pair, landscape in zip(shown, found, strict=True)]
+
+
+def with_model_landscape(pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel) -> list[ShownPair]:
+    """The pairs with the model's landscape: its energy, or of a score model the length of the score.
+
+    That is small where the model takes the pose for right.
+    """
+    grid, radius = landscape_grid(), truths(shown)[:, 2]
+    score, energy = model_field(model, pairs, radius, grid)
+    name = "length of the model's score" if energy is None else "energy of the model"
+    values = (score.norm(dim=-1) if energy is None else energy).cpu()
+    return [
+        with_landscape(pair, name, Landscape(*grid, *each))
+        for pair, *each in zip(shown, radius.tolist(), values, strict=True)
+    ]
+
+
+def with_landscape(pair: ShownPair, name: str, landscape: Landscape) -> ShownPair:
+    """The pair with one more landscape."""
+    return replace(pair, landscapes={**pair.landscapes, name: landscape})
+
+
+def with_fields(
+    pairs: Pairs,
+    shown: Sequence[ShownPair],
+    model: PoseModel,
+    ways: Sequence[Ways],
+    first_stage: Langevin | None,
+    starts: Tensor,
+    seed: int,
+) -> list[ShownPair]:
+    """The pairs with two maps each: the model's field under `ways`, and the exact one, the best there is to learn.
+
+    On that are the ways of `first_stage` with the exact field in the model's place, where there is one.
+    """
+    exact = ExactModel(model.kernel, truths(shown), model.has_energy)
+    ideal: Sequence[Ways | None] = [None] * len(shown)
+    if first_stage is not None:
+        guided = copy.copy(first_stage)
+        guided.model = exact  # type: ignore[assignment]  # has all of a PoseModel that this solver asks for
+        ideal = [pair.ways for pair in solved_pairs(pairs, shown, guided, starts, seed)]
+    field = "exp(-E) and score" if model.has_energy else "score"
+    learned = field_maps(pairs, shown, model, f"Learned {field}", ways)
+    oracle = field_maps(pairs, shown, exact, f"Exact {field} (oracle)", ideal)
+    return [replace(pair, maps=maps) for pair, *maps in zip(shown, learned, oracle, strict=True)]
+
+
+def field_maps(
+    pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel | ExactModel, title: str, ways: Sequence[Ways | None]
+) -> list[PoseMap]:
+    """A map a pair of a model's score and, of an energy model, of exp(-E), under the ways of a solver."""
+    radius = truths(shown)[:, 2]
+    densities: Sequence[Landscape | None] = [None] * len(shown)
+    if model.has_energy:
+        energies = model_field(model, pairs, radius, DENSITY_GRID).energy
+        assert energies is not None
+        densities = [
+            Landscape(*DENSITY_GRID, *each).density() for each in zip(radius.tolist(), energies.cpu(), strict=True)
+        ]
+    arrows = model_arrows(model, pairs, radius, ARROW_SPACING)
+    return [
+        PoseMap(title, density=density, arrows=each, ways=way)
+        for density, each, way in zip(densities, arrows, ways, strict=True)
+    ]
+
+
+# ---------------------------------------------------------------- all of it
+
+
+class ExplainedPair(NamedTuple):
+    """A pair with its landscape, its ways and maps; what the prior generates at the ends, `[N, H, W, 3]` each; and the
+    model's field on the landscape's grid, where there is a model.
+    """
+
+    pair: ShownPair
+    views: list[NDArray]
+    field: FieldValue | None
+
+
+def explained_pair(
+    pairs: Pairs,
+    pair: ShownPair,
+    solver: Solver,
+    prior: Prior,
+    model: PoseModel | None,
+    starts: Tensor,
+    draws: Draws,
+    grid: Grid,
+) -> ExplainedPair:
+    """One pair, solved once, with those starts alone that came to a pose.
+
+    The maps are of the first stage without noise, over the model's field and over the exact one. Photographs, whose
+    truth is not known, have none.
+    """
+    seed, field = draws.seed, None
+    (pair,) = with_prior_energy(pairs, [pair], prior, draws, grid)
+    (pair,) = solved_pairs(pairs, [pair], solver, starts, seed)
+    pair, views = pair.arrived(), []
+    if pair.trajectories is not None:  # the same poses, with longitudes unreduced
+        pair = replace(pair, ends=pair.trajectories[:, -1])
+    if len(pair.ends):
+        source = prior.encode(pairs.images[pairs.reference])
+        views = list(generated_views(prior, source, torch.from_numpy(pair.ends), *SAMPLING, seed))
+    if model is not None and pair.truth is not None:
+        field = model_field(model, pairs, truths([pair])[:, 2], grid)
+        first_stage = Langevin(model, gamma=0.0)
+        ways = [each.ways for each in solved_pairs(pairs, [pair], first_stage, starts, seed)]
+        (pair,) = with_fields(pairs, [pair], model, ways, first_stage, starts, seed)
+    return ExplainedPair(pair, views, field)
+
+
+def _array(values: Tensor) -> NDArray:
+    array: NDArray = values.detach().cpu().numpy()
+    return array

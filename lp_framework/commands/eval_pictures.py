@@ -1,0 +1,57 @@
+"""The pictures of an evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examples
+from lp_framework.analysis.shown import ShownPair
+from lp_framework.data.pairs import PairData
+from lp_framework.evaluation.evaluation import Evaluation
+from lp_framework.evaluation.metrics import summarise
+from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
+from lp_framework.viz.maps import field_figure
+from lp_framework.viz.style import save_figure
+
+
+def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
+    """After `Trainer.test`: fields of some pairs (failures first), cumulative errors, and the objects, into `folder`.
+
+    Each as PNG and PDF; returns the PNG files. Sets of images have no fields. `EXAMPLES` below the folder gets the
+    pairs, for the page of the run.
+    """
+    examples = gather_examples(evaluation, data)
+    save_examples(folder / EXAMPLES, examples)
+    rows, table = evaluation.metrics.rows(), evaluation.table
+    rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
+    figures = {
+        f"field_{number}": field_figure(pair, f"{pair.title} ({pair.ambiguity})", answer_note(pair))
+        for number, pair in enumerate(pair for pair in examples if pair.maps)
+    }
+    classes = [table.ambiguities[index] for index in rows["object"].tolist()]
+    figures["errors"] = errors_figure(rotation, translation, chosen, classes)
+    figures["objects"] = objects_figure(object_cards(evaluation, data))
+    return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
+
+
+def answer_note(pair: ShownPair) -> str:
+    """Why a pair is shown, and how far off its answer is."""
+    degrees, distance = pair.rotation_errors[pair.chosen], pair.translation_errors[pair.chosen]
+    off = f"rotation error {degrees:.1f}°, translation error {distance:.2f}"
+    return f"{pair.reason}: {'no answer' if np.isnan(degrees) else off}"
+
+
+def object_cards(evaluation: Evaluation, data: PairData) -> list[ObjectCard]:
+    """A card for every object that has pairs, with its first view; no success rate where a pair has one answer."""
+    rows, table, images = evaluation.metrics.rows(), data.table, data.images
+    assert images is not None  # evaluation never caches features
+    cards = []
+    for index in rows["object"].unique().tolist():
+        mask = rows["object"] == index
+        metrics = summarise(rows["rotation"][mask], rows["translation"][mask], rows["chosen"][mask])
+        image = np.asarray(images[table.views_of(index)[0]])
+        success = None if evaluation.solver.one_answer else metrics["SR(R)@30"]
+        cards.append(ObjectCard(table.names[index], table.ambiguities[index], image, metrics["R(R)@15"], success))
+    return cards
