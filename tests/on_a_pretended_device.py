@@ -24,6 +24,7 @@ from tiny_runs import Commands
 
 from lp_framework import api, load_prior, registry
 from lp_framework.benchmarks.second_stage import NARROW, random_pair
+from lp_framework.commands.eval_pictures import save_pictures
 from lp_framework.data.pairs import PairData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.priors.base import Prior
@@ -31,7 +32,6 @@ from lp_framework.priors.zero123.networks import Networks
 from lp_framework.priors.zero123.prior import Zero123Prior
 from lp_framework.solvers.base import Solution
 from lp_framework.solvers.pair_energy import PairEnergy
-from lp_framework.viz.pictures import save_pictures
 
 ON_HOST = ("dust3r", "features", "vggt")  # matching and other people's packages compute in NumPy, or by themselves
 FORWARD_MODE = ("gauss_newton",)  # its derivatives do not pass through a device written in Python; see its own tests
@@ -160,7 +160,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Once called, commands choose the device, as they would choose a GPU."""
 
     def choose() -> None:
-        for command in ("bench", "estimate", "figure", "landscape", "pair_landscape", "views"):
+        for command in ("bench", "estimate", "figure", "landscape", "views"):
             monkeypatch.setattr(f"lp_framework.commands.{command}.choose_device", lambda accelerator: FAR)
         strategy = SingleDeviceStrategy(device=FAR, accelerator=FarAccelerator())
         trainer = functools.partial(Trainer, strategy=strategy)
@@ -203,7 +203,7 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
     assert gathered_on == [FAR]  # NCCL gathers what is on GPUs
-    assert drawn_on == ([] if solver == "multiview" else [FAR])
+    assert drawn_on == [FAR]
 
 
 @pytest.mark.parametrize(("name", "settings"), [("score", ("data.image_size=64",)), ("prior", PRIOR)])

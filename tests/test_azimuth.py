@@ -10,7 +10,7 @@ from exact_prior import ExactPrior, image_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lp_framework.analysis.azimuth import Profile, azimuth_energies, profile, within
+from lp_framework.analysis.ambiguity import Profile, azimuth_energies, profile, within
 from lp_framework.analysis.fields import Draws
 from lp_framework.solvers.base import Pairs
 

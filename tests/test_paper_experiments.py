@@ -109,8 +109,7 @@ def evaluated(commands: Commands, experiment: str, checkpoint: str, *data: str) 
     ("experiment", "data", "pairs", "row"),
     [("main", GSO, 2 * 3, "GSO, Ours"), ("hopev2", HOPE, 3 * 2, "Ours"), ("co3d", CO3D, 3, "Ours")],
 )
-def test_training_and_table_run_on_a_download(commands, monkeypatch, experiment, data, pairs, row):
-    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+def test_training_and_table_run_on_a_download(commands, experiment, data, pairs, row):
     ran = trained(commands, f"trained_{experiment}", *data)
     assert ran.status == 0, ran.err
     ran, folder = evaluated(commands, experiment, f"trained_{experiment}", *data)
@@ -123,8 +122,7 @@ def test_training_and_table_run_on_a_download(commands, monkeypatch, experiment,
     assert "paper: OO3D, Ours" not in ran.out.split("paper: GSO, Ours")[0]  # GSO's own comes first, beside ours
 
 
-def test_other_data_with_the_model_of_another(commands, monkeypatch):
-    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+def test_other_data_with_the_model_of_another(commands):
     assert trained(commands, "gso_model", *GSO).status == 0
     ran, folder = evaluated(commands, "unseen", "gso_model", *GSO, "data.objects=unseen")
     assert ran.status == 0, ran.err

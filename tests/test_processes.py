@@ -26,37 +26,16 @@ pytestmark = pytest.mark.skipif(
 )
 TEST_VIEWS = 5
 SPREAD = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
-EVALUATION = (
-    "checkpoint=./score",
-    "batch_pairs=7",
-    "solver.iterations=5",
-)  # 80 pairs: 12 batches, the last of 3
+# 80 pairs are 12 batches, the last one of 3.
+EVALUATION = ("checkpoint=./score", "batch_pairs=7", "solver.iterations=5", "pictures=false")
 
 
 @pytest.fixture(scope="module")
 def commands(tmp_path_factory) -> Commands:
     commands = Commands(tmp_path_factory.mktemp("processes"), test_views=TEST_VIEWS)
-    (commands.folder / "plugins" / "tmp_tiny" / "tmp_tiny_unseen.py").write_text(NO_PICTURES)
     trained = commands.here("score", "train", "trainer.max_epochs=1", "backbone.pause=0.05")
     assert trained.status == 0, trained.err
     return commands
-
-
-# Pictures take most of a run's time.
-NO_PICTURES = """
-import lp_framework.viz.pictures
-
-lp_framework.viz.pictures.save_pictures = lambda *arguments: []
-lp_framework.viz.pictures.save_summaries = lambda *arguments: []
-"""
-
-
-@pytest.fixture(autouse=True)
-def no_pictures(monkeypatch):
-    """In this process neither."""
-    for module in ("lp_framework.viz.pictures", "lp_framework.commands.eval"):
-        monkeypatch.setattr(f"{module}.save_pictures", lambda *arguments: [])
-        monkeypatch.setattr(f"{module}.save_summaries", lambda *arguments: [])
 
 
 def two_processes(commands: Commands, name: str, command: str, *overrides: str) -> Ran:

@@ -23,14 +23,7 @@ from lp_framework.evaluation.metrics import SolvedBatch
 TEST_VIEWS = 5
 PAIRS = len(OBJECTS) * TEST_VIEWS * (TEST_VIEWS - 1)
 BATCH = 7  # 80 pairs are 12 batches, the last one of 3
-EVALUATION = ("checkpoint=./score", f"batch_pairs={BATCH}", "solver.iterations=5")
-
-
-@pytest.fixture(autouse=True)
-def no_pictures(monkeypatch):
-    """They take most of a run's time."""
-    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
-    monkeypatch.setattr("lp_framework.commands.eval.save_summaries", lambda *arguments: [])
+EVALUATION = ("checkpoint=./score", f"batch_pairs={BATCH}", "solver.iterations=5", "pictures=false")
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from tiny_runs import Commands, Ran
 from lp_framework.report.paper import paper_tables
 
 ROOT = Path(__file__).parents[1]
-SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2")
+SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2", "pictures=false")
 
 
 # ---------------------------------------------------------------- experiments
@@ -109,9 +109,8 @@ def commands(tmp_path_factory) -> Commands:
 
 
 @pytest.fixture
-def sweep(commands, monkeypatch):
+def sweep(commands):
     """`sweep("seed=0,1")` in a folder that is new for every test; no pictures, which take most of a run's time."""
-    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
     number = sum(each.name.startswith("sweep") for each in commands.folder.iterdir())
 
     def run(*overrides: str) -> Ran:
@@ -176,15 +175,13 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
     assert "skipped" in sweep("seed=0").out
 
 
-def test_a_single_run_is_made_anew(commands, monkeypatch):
-    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+def test_a_single_run_is_made_anew(commands):
     for _ in range(2):
-        ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2")
+        ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2", "pictures=false")
         assert ran.status == 0 and "skipped" not in ran.out
 
 
-def test_an_experiment_goes_on_in_its_own_folder(commands, monkeypatch):
-    monkeypatch.setattr("lp_framework.commands.eval.save_pictures", lambda *arguments: [])
+def test_an_experiment_goes_on_in_its_own_folder(commands):
     first = ("experiment=gamma", "solver=langevin", "checkpoint=./score", "seed=0", "solver.gamma=0,0.3")
     assert commands.here("unused", "eval", *first).status == 0
     more = commands.here("unused", "eval", *first[:-2], "seed=0,1", "solver.gamma=0,0.3")
@@ -213,7 +210,6 @@ def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice
     if not (commands.folder / "slurm").exists():
         slurm_stand_in.install(commands.folder / "slurm")
     monkeypatch.setenv("PATH", f"{commands.folder / 'slurm'}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setattr("lp_framework.viz.pictures.save_pictures", None)  # the plugin changes it here, too
     quick = commands.folder / "plugins" / "tmp_tiny_quick"
     quick.mkdir(exist_ok=True)
     (quick / "tmp_tiny_quick.py").write_text(QUICK)
@@ -260,14 +256,11 @@ def test_a_launcher_that_is_not_installed(lp, monkeypatch, launcher, extra):
     assert ran.error == f"hydra/launcher={name} is not installed: pip install 'lp_framework[{extra}]'"
 
 
-# A solver of a plugin, and no pictures, which take most of a run's time.
+# A solver of a plugin.
 QUICK = '''
-import lp_framework.viz.pictures
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.langevin import Langevin
-
-lp_framework.viz.pictures.save_pictures = lambda *arguments: []
 
 
 @register("solver", "tmp_tiny_quick")

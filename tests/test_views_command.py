@@ -207,7 +207,7 @@ def test_the_prior_that_ships_draws_the_embedded_objects(lp, tmp_path):
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ("object=tran", "data=renderings has no object 'tran'; did you mean 'tram'? (known: cup, tram, vase)"),
+        ("object=tran", "the data have no object 'tran'; did you mean 'tram'? (known: cup, tram, vase)"),
         ("image=nowhere.png", "nowhere.png: there is no such image"),
         ("longitudes=0", "longitudes must be a number of them, at least 1, got 0"),
         ("longitudes=2.5", "longitudes must be a number of them, at least 1, got 2.5"),

@@ -174,8 +174,8 @@ def test_broken_model_is_drawn_too():
 
 def test_arrows_are_drawn_in_the_scale_that_they_are_given():
     arrows = Arrows(np.array([-30.0, 30.0]), np.array([90.0, 270.0]), np.full((2, 2, 3), 0.5))
-    for given, scale in ((arrows, math.sqrt(0.5)), (arrows._replace(scale=2.0), 2.0)):
-        quiver = draw_map(Figure().add_subplot(), PoseMap(arrows=given))
+    for each, scale in ((arrows, math.sqrt(0.5)), (arrows._replace(scale=2.0), 2.0)):
+        quiver = draw_map(Figure().add_subplot(), PoseMap(arrows=each))
         assert quiver is not None and quiver.norm.vmax == pytest.approx(scale)
 
 
@@ -468,3 +468,16 @@ def test_solver_without_model_has_one_map_without_arrows(data: PairData):
     figure = field_figure(pair, "a", "b")
     assert len(figure.axes) == 3  # two images, one map, no colour bar
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["true pose", "answer"]
+
+
+def test_the_shown_pairs_are_solved_once(data: PairData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    evaluation = evaluated(Guess(), data, Ring(4))
+    solve, asked = Guess.solve, []
+
+    def counted(solver: Guess, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        asked.append(len(pairs))
+        return solve(solver, pairs, starts, seed)
+
+    monkeypatch.setattr(Guess, "solve", counted)
+    files = save_pictures(tmp_path, evaluation, data)
+    assert asked == [len(read_examples(tmp_path / EXAMPLES))] and len(files) == asked[0] + 2

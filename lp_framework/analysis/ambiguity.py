@@ -1,24 +1,93 @@
-"""How far the views of an object leave their relative longitude open, told by a prior before anything is trained.
+"""How well a prior's energy singles out the azimuth of an object, and how far its views leave it open.
 
-From landscapes of a few pairs. The *valley floor* is the lowest ground at each longitude, in the range of its
-landscape; its mean over the pairs, each turned so that the truth is at 0, is what the object itself has of valleys.
+The first thing to know of a prior and an object, before anything is trained. A narrow valley at the truth and nothing
+else: any start will do. A second valley at half a turn: the shape looks the same from behind. No valley: no method can
+tell the longitude. The *valley floor* is the lowest ground at each longitude, in the range of its landscape; its mean
+over pairs, each turned so that the truth is at 0, is what the object itself has of valleys.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lp_framework.analysis.azimuth import Profile, profile
-from lp_framework.analysis.landscapes import FLAT, Landscape
+from lp_framework.analysis.fields import Draws, pose_energies, prior_landscapes
+from lp_framework.analysis.landscapes import FLAT, Grid, Landscape, valleys
+from lp_framework.data.cache import tracked
+from lp_framework.data.module import PairDataModule
+from lp_framework.geometry import wrap_angle
+from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs, pairs_of
 
+NEAR_DEGREES = 15.0
+PROMINENCE = 0.1  # of a profile's range; a shallower dent is no minimum
 EQUAL = 0.05  # of the floor's range; valleys whose depths differ by less are equally good answers
 HALF_TURN = 30.0  # degrees; so far from 180 a second valley may lie to be one of the other side
+PAIRS = 8  # an object, for its ambiguity
 
 Verdict = Literal["unique", "twofold", "several", "continuous"]
+
+
+# ---------------------------------------------------------------- around an object
+
+
+def azimuth_energies(prior: Prior, pairs: Pairs, poses: Tensor, azimuths: Tensor, draws: Draws) -> Tensor:
+    """Energies `[B, A]` at the relative longitudes `azimuths` `[A]` (radians), for B pairs of true `poses` `[B, 3]`.
+
+    As `prior_landscapes`, but latitude and radius are the true ones.
+    """
+    around = poses[:, None].repeat(1, len(azimuths), 1)
+    around[..., 1] = azimuths.to(poses)
+    return pose_energies(prior, pairs, around, draws)
+
+
+def within(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Tensor:
+    """Whether the azimuth of least energy is within `NEAR_DEGREES` of the truth, `[P]`."""
+    best = azimuths[energies.argmin(dim=1)]
+    return wrap_angle(best - truth).abs() <= math.radians(NEAR_DEGREES)
+
+
+class Minimum(NamedTuple):
+    """A local minimum of a profile: its place (degrees from the truth) and its height in the profile's range."""
+
+    degrees: float
+    height: float
+
+
+class Profile(NamedTuple):
+    """The mean energy around an object `[A]` over the azimuth's distance from the truth `[A]` (degrees, -180 first)."""
+
+    degrees: Tensor
+    energy: Tensor
+
+    @property
+    def relief(self) -> float:
+        """Its range over its mean: next to 0 where the energy does not tell the azimuth."""
+        return ((self.energy.max() - self.energy.min()) / self.energy.mean()).item()
+
+    def minima(self) -> list[Minimum]:
+        """Its local minima, the deepest first; a dent of less than `PROMINENCE` of the range does not count."""
+        found = valleys(self.energy[None], PROMINENCE)
+        return [Minimum(self.degrees[valley.cell].item(), valley.height) for valley in found]
+
+
+def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:
+    """The profile of pairs: `energies` `[P, A]` at evenly spaced `azimuths` `[A]`, by distance from `truth` `[P]`."""
+    count = len(azimuths)
+    offset = wrap_angle(azimuths - truth[:, None])
+    place = (offset / (2 * math.pi / count)).round().long() % count
+    total = torch.zeros(count, dtype=energies.dtype).index_add(0, place.flatten(), energies.flatten())
+    mean = total / torch.bincount(place.flatten(), minlength=count)
+    degrees = torch.arange(count) * 360.0 / count
+    turned = (count + 1) // 2
+    return Profile((degrees.roll(-turned) + 180) % 360 - 180, mean.roll(-turned))
+
+
+# ---------------------------------------------------------------- the ambiguity of an object
 
 
 class Ambiguity(NamedTuple):
@@ -37,11 +106,11 @@ class Ambiguity(NamedTuple):
         """`continuous`: the floor is flat. Else by its valleys: one, a second one half a turn away, or other ones."""
         if self.flatness >= FLAT:
             return "continuous"
-        valleys = [minimum.degrees for minimum in self.floor.minima()]
-        if len(valleys) == 1:
+        places = [minimum.degrees for minimum in self.floor.minima()]
+        if len(places) == 1:
             return "unique"
-        apart = abs(valleys[1] - valleys[0])
-        return "twofold" if len(valleys) == 2 and abs(apart - 180) <= HALF_TURN else "several"
+        apart = abs(places[1] - places[0])
+        return "twofold" if len(places) == 2 and abs(apart - 180) <= HALF_TURN else "several"
 
     @property
     def unique_answer(self) -> bool:
@@ -65,3 +134,53 @@ def ambiguity(landscapes: Sequence[Landscape], truth: Tensor) -> Ambiguity:
     floor = profile(floors, landscapes[0].longitude.double(), truth.double())
     minima = sum(len(landscape.minima()) for landscape in landscapes) / len(landscapes)
     return Ambiguity(1 - (floor.energy.max() - floor.energy.min()).item(), floor, minima)
+
+
+# ---------------------------------------------------------------- all objects
+
+
+def overview(
+    data: PairDataModule, prior: Prior, device: torch.device, draws: Draws, grid: Grid, azimuths: int
+) -> dict[str, Any]:
+    """`objects`, a row an object, and the shares of pairs whose least energy is at the truth, as plain values.
+
+    `azimuths` of them around each pair that the data were told to evaluate on (`evaluate_on`), with latitude and radius
+    true; the ambiguity by landscapes over `grid` of up to `PAIRS` pairs of the protocol `per_view`.
+    """
+    split = data.evaluation_split()
+    table, batches = data.table(split), data.data(split)
+    places = torch.arange(azimuths) * (2 * math.pi / azimuths)
+    energies, truth, objects = [], [], []
+    for batch in tracked(list(data.test_dataloader()), "energies around the objects"):
+        poses, pairs = batch.relative_poses(), pairs_of(batch, table, device)
+        energies.append(azimuth_energies(prior, pairs, poses.to(device), places, draws).cpu())
+        truth.append(poses[:, 1])
+        objects.append(batch.objects[batch.reference])
+    energy, longitude, index = torch.cat(energies), torch.cat(truth), torch.cat(objects)
+    near = within(energy, places, longitude)
+    per_view = table.pairs("per_view", draws.seed)  # a row a view
+    rows: list[dict[str, Any]] = []
+    for number in tracked(range(len(table.names)), "ambiguity of the objects"):
+        mask = index == number
+        curve = profile(energy[mask], places, longitude[mask])
+        batch = batches[per_view[table.views_of(number)[:PAIRS]]]
+        true = batch.relative_poses()
+        landscapes = prior_landscapes(prior, pairs_of(batch, table, device), true[:, 2], grid, draws)
+        rows.append(
+            {
+                "object": table.names[number], "ambiguity": table.ambiguities[number],
+                "unique_answer": table.unique_answer[number],
+                "pairs": int(mask.sum()), "within": near[mask].double().mean().item(),
+                "relief": curve.relief, "minima": [minimum._asdict() for minimum in curve.minima()],
+                "degrees": curve.degrees.tolist(), "energy": curve.energy.tolist(),
+                "ambiguity_score": ambiguity(landscapes, true[:, 1]).record(),
+            }
+        )  # fmt: skip
+    unique = [row for row in rows if row["unique_answer"]]
+    return {"objects": rows, "within": _share(rows), "within_unique_answer": _share(unique)}
+
+
+def _share(rows: list[dict[str, Any]]) -> float | None:
+    """The share of pairs within the limit, over the objects of `rows`."""
+    pairs = sum(row["pairs"] for row in rows)
+    return sum(row["within"] * row["pairs"] for row in rows) / pairs if pairs else None

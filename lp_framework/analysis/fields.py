@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -43,16 +43,6 @@ class Draws(NamedTuple):
         each = "one noise" if self.noises == 1 else f"{self.noises} noises"
         steps = ", ".join(map(str, self.timesteps))
         return f"Mean over both directions of the pair, timesteps {steps} and {each} at each."
-
-
-class PoseField(Protocol):
-    """What is asked of a model of the pose, see `PoseModel`."""
-
-    def encode(self, images: Tensor) -> Tensor: ...
-
-    def condition(self, reference: Tensor, query: Tensor) -> Tensor: ...
-
-    def field(self, condition: Tensor, pose: Tensor) -> FieldValue: ...
 
 
 class ExactModel(nn.Module):
@@ -138,14 +128,24 @@ def prior_field(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Fiel
 
 
 @torch.no_grad()
-def model_field(model: PoseField, pairs: Pairs, radius: Tensor, grid: Grid) -> FieldValue:
+def model_field(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid) -> FieldValue:
     """A model's scores `[B, A, O, 3]` and, of an energy model, energies `[B, A, O]`, at relative radii `[B]`."""
     features = model.encode(pairs.images)
     condition = model.condition(features[pairs.reference], features[pairs.query])[:, None, None]
     return model.field(condition, grid_poses(radius.to(pairs.images.device), *grid))
 
 
-def model_arrows(model: PoseField, pairs: Pairs, radius: Tensor, spacing: float) -> list[Arrows]:
+def model_landscapes(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid) -> list[Landscape]:
+    """A model's energy over a grid for B pairs, at relative radii `[B]`; of a score model the length of the score.
+
+    That is small where the model takes the pose for right.
+    """
+    score, energy = model_field(model, pairs, radius, grid)
+    values = (score.norm(dim=-1) if energy is None else energy).cpu()
+    return [Landscape(*grid, *each) for each in zip(radius.tolist(), values, strict=True)]
+
+
+def model_arrows(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, spacing: float) -> list[Arrows]:
     """A model's scores for B pairs on `cell_grid`, at relative radii `[B]`."""
     grid = cell_grid(spacing)
     return arrows(grid, model_field(model, pairs, radius, grid).score)

@@ -16,7 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.analysis.fields import Draws, ExactModel, model_arrows, model_field, prior_landscapes
+from lp_framework.analysis.fields import (
+    Draws,
+    ExactModel,
+    model_arrows,
+    model_field,
+    model_landscapes,
+    prior_landscapes,
+)
 from lp_framework.analysis.generated import generated_views
 from lp_framework.analysis.landscapes import Grid, Landscape, PoseMap, Ways, landscape_grid
 from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
@@ -147,28 +154,18 @@ def with_prior_energy(
 ) -> list[ShownPair]:
     """The pairs with the prior's landscape, on the paper's grid unless given, at the true relative radii or at 0."""
     radius = torch.tensor([0.0 if pair.truth is None else float(pair.truth[2]) for pair in shown])
-    found = prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws)
-    return [with_landscape(pair, PRIOR_ENERGY, landscape) for pair, landscape in zip(shown, found, strict=True)]
+    return with_landscapes(shown, PRIOR_ENERGY, prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws))
 
 
 def with_model_landscape(pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel) -> list[ShownPair]:
-    """The pairs with the model's landscape: its energy, or of a score model the length of the score.
-
-    That is small where the model takes the pose for right.
-    """
-    grid, radius = landscape_grid(), truths(shown)[:, 2]
-    score, energy = model_field(model, pairs, radius, grid)
-    name = "length of the model's score" if energy is None else "energy of the model"
-    values = (score.norm(dim=-1) if energy is None else energy).cpu()
-    return [
-        with_landscape(pair, name, Landscape(*grid, *each))
-        for pair, *each in zip(shown, radius.tolist(), values, strict=True)
-    ]
+    """The pairs with `model_landscapes` at their true relative radii."""
+    name = "energy of the model" if model.has_energy else "length of the model's score"
+    return with_landscapes(shown, name, model_landscapes(model, pairs, truths(shown)[:, 2], landscape_grid()))
 
 
-def with_landscape(pair: ShownPair, name: str, landscape: Landscape) -> ShownPair:
-    """The pair with one more landscape."""
-    return replace(pair, landscapes={**pair.landscapes, name: landscape})
+def with_landscapes(shown: Sequence[ShownPair], name: str, found: Sequence[Landscape]) -> list[ShownPair]:
+    """The pairs with one more landscape each."""
+    return [replace(pair, landscapes={**pair.landscapes, name: each}) for pair, each in zip(shown, found, strict=True)]
 
 
 def with_fields(
@@ -203,16 +200,9 @@ def field_maps(
     radius = truths(shown)[:, 2]
     densities: Sequence[Landscape | None] = [None] * len(shown)
     if model.has_energy:
-        energies = model_field(model, pairs, radius, DENSITY_GRID).energy
-        assert energies is not None
-        densities = [
-            Landscape(*DENSITY_GRID, *each).density() for each in zip(radius.tolist(), energies.cpu(), strict=True)
-        ]
+        densities = [each.density() for each in model_landscapes(model, pairs, radius, DENSITY_GRID)]
     arrows = model_arrows(model, pairs, radius, ARROW_SPACING)
-    return [
-        PoseMap(title, density=density, arrows=each, ways=way)
-        for density, each, way in zip(densities, arrows, ways, strict=True)
-    ]
+    return [PoseMap(title, None, *parts) for parts in zip(densities, arrows, ways, strict=True)]
 
 
 # ---------------------------------------------------------------- all of it

@@ -17,11 +17,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from lp_framework.analysis.azimuth import NEAR_DEGREES
+from lp_framework.analysis.ambiguity import NEAR_DEGREES, overview
 from lp_framework.analysis.examples import EXAMPLES, save_examples
 from lp_framework.analysis.fields import Draws
-from lp_framework.analysis.landscapes import Grid, landscape_grid
-from lp_framework.analysis.overview import overview
+from lp_framework.analysis.landscapes import landscape_grid
 from lp_framework.analysis.pairs import ExplainedPair, explained_pair, named_pairs
 from lp_framework.analysis.shown import ShownPair, View, words
 from lp_framework.api import move, view_set
@@ -42,7 +41,7 @@ from lp_framework.evaluation.tables import write_arrays, write_json
 from lp_framework.geometry import wrap_angle
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
-from lp_framework.viz.azimuth import AzimuthPanel, azimuth_figure
+from lp_framework.viz.azimuth import azimuth_figure
 from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.maps import field_figure, pair_figure
 from lp_framework.viz.style import save_figure
@@ -62,10 +61,26 @@ def run(config: DictConfig) -> None:
     draws = Draws(list(config.timesteps), config.noises, config.seed, config.batch)
     device = choose_device(config.accelerator)
     components = Components(plain(config))
+    console = Console(width=None if Console().is_terminal else 110, highlight=False)
     if config.object is None and config.images is None:
-        run_overview(config, components, folder, device, draws, grid)
+        data = components["data"]
+        data.evaluate_on(config.protocol, config.seed)
+        data.prepare_data()
+        record = overview(data, components["prior"].to(device), device, draws, grid, config.azimuths)
+        write_overview(console, config, folder, record)
     else:
-        run_pair(config, components, folder, device, draws, grid)
+        if config.images is not None:
+            pairs, pair = photographs(config, device)
+        else:
+            pairs, pair = data_pair(config, components["data"], device)
+        solver, prior = components["solver"], components["prior"].to(device)
+        move(solver, device)
+        model = None if pair.truth is None else components["model"].to(device)
+        starts = components["start"].make(pairs, config.seed)
+        with shown_progress():
+            found = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
+        write_pair(console, config, folder, found, draws, components.checkpoint)
+    console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
 
 
 def check(config: DictConfig) -> None:
@@ -91,29 +106,17 @@ def check(config: DictConfig) -> None:
 # ---------------------------------------------------------------- a pair
 
 
-def run_pair(
-    config: DictConfig, components: Components, folder: Path, device: torch.device, draws: Draws, grid: Grid
+def write_pair(
+    console: Console, config: DictConfig, folder: Path, found: ExplainedPair, draws: Draws, checkpoint: Path | None
 ) -> None:
     """Write `landscape.npz`, `landscape.json` and the pictures `landscape`, `surface` and `fields`; print the minima.
 
     Of photographs, whose truth is not known, the slice is at relative radius 0, and there are no fields.
     """
-    if config.images is not None:
-        pairs, pair = photographs(config, device)
-    else:
-        pairs, pair = data_pair(config, components["data"], device)
-    solver, prior = components["solver"], components["prior"].to(device)
-    move(solver, device)
-    model = None if pair.truth is None else components["model"].to(device)
-    starts = components["start"].make(pairs, config.seed)
-    with shown_progress():
-        found = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
-
     pair, method = found.pair, words(config.solver.name)
     write_arrays(folder / "landscape.npz", landscape_arrays(found))
-    checkpoint = None if components.checkpoint is None else str(components.checkpoint)
-    record = {"checkpoint": checkpoint, "seed": config.seed, "config": plain(config), "versions": versions()}
-    write_json(folder / "landscape.json", {**summary(pair), **record})
+    record = {**summary(pair), "checkpoint": str(checkpoint) if checkpoint else None, "seed": config.seed}
+    write_json(folder / "landscape.json", {**record, "config": plain(config), "versions": versions()})
     heading = f"Energy of prior {config.prior.name}, ways of {method}"
     figures = {
         "landscape": pair_figure(pair, found.views, pair.object, energy_note(pair, draws), heading),
@@ -125,11 +128,9 @@ def run_pair(
     pictures = [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
     example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
     save_examples(folder / "pictures" / EXAMPLES, [example])
-    console = Console(width=None if Console().is_terminal else 110, highlight=False)
     console.print(pair_table(f"{pair.object}, prior={config.prior.name}", method, pair))
-    console.print(f"results:  {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
-    console.print(f"pictures: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True)
-    console.print(f"page:     {write_run_page(folder, 'landscape')}", soft_wrap=True)
+    console.print(f"results: {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
+    console.print(f"picture: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True)
 
 
 def data_pair(config: DictConfig, data: PairDataModule, device: torch.device) -> tuple[Pairs, ShownPair]:
@@ -166,11 +167,8 @@ def landscape_arrays(found: ExplainedPair) -> dict[str, Any]:
         "trajectories": pair.ends[:, None] if pair.trajectories is None else pair.trajectories, "truth": pair.truth,
     }  # fmt: skip
     if found.field is not None:
-        score, energy = found.field
-        arrays |= {
-            "model_score": score[0].cpu().numpy(),
-            "model_energy": None if energy is None else energy[0].cpu().numpy(),
-        }
+        arrays |= {f"model_{name}": None if value is None else value[0].cpu().numpy()
+                   for name, value in found.field._asdict().items()}  # fmt: skip
     return {name: each for name, each in arrays.items() if each is not None}
 
 
@@ -224,9 +222,8 @@ def in_degrees(pose: NDArray) -> tuple[float, float, float]:
 
 def pair_table(title: str, method: str, pair: ShownPair) -> Table:
     """The truth, the minima and the ends."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in ("", "latitude", "longitude", "height", "prominence", "from the truth"):
-        table.add_column(column, justify="right" if column else "left", no_wrap=True)
+    columns = ("", "latitude", "longitude", "height", "prominence", "from the truth")
+    table = table_of(title, columns, numbers=columns[1:])
 
     def add(name: str, latitude: float, longitude: float, *cells: str) -> None:
         table.add_row(name, f"{latitude:.0f}°", f"{longitude:.0f}°", *cells)
@@ -252,38 +249,23 @@ def pair_table(title: str, method: str, pair: ShownPair) -> Table:
 # ---------------------------------------------------------------- all objects
 
 
-def run_overview(
-    config: DictConfig, components: Components, folder: Path, device: torch.device, draws: Draws, grid: Grid
-) -> None:
+def write_overview(console: Console, config: DictConfig, folder: Path, record: dict[str, Any]) -> None:
     """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
-    prior, data = components["prior"].to(device), components["data"]
-    data.evaluate_on(config.protocol, config.seed)
-    data.prepare_data()
-    record = overview(data, prior, device, draws, grid, config.azimuths)
     write_json(folder / "azimuth.json", {**record, "config": plain(config), "versions": versions()})
     rows = record["objects"]
-    panels = [
-        AzimuthPanel(*(row[key] for key in ("object", "ambiguity", "degrees", "energy", "within"))) for row in rows
-    ]
-    picture, _ = save_figure(azimuth_figure(panels), folder / "azimuth")
-    console = Console(width=None if Console().is_terminal else 110, highlight=False)
+    picture, _ = save_figure(azimuth_figure(rows), folder / "azimuth")
     console.print(overview_table(f"{config.data.name}, prior={config.prior.name}", record))
     if unanswered := [row["object"] for row in rows if not row["ambiguity_score"]["unique_answer"]]:
         console.print(f"without a unique answer to this prior: {', '.join(unanswered)}", soft_wrap=True)
     console.print(f"results: {folder / 'azimuth.json'}", soft_wrap=True)
     console.print(f"picture: {picture}", soft_wrap=True)
-    console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
 
 
 def overview_table(title: str, record: dict[str, Any]) -> Table:
     """A row an object, then the shares over all of them."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in (
-        "object", "class", f"within {NEAR_DEGREES:g}°", "relief", "minima (degrees from truth: height)", "flatness",
-        "verdict",
-    ):  # fmt: skip
-        numbers = column in ("relief", "flatness") or column.startswith("within")
-        table.add_column(column, justify="right" if numbers else "left", no_wrap=True)
+    near = f"within {NEAR_DEGREES:g}°"
+    columns = ("object", "class", near, "relief", "minima (degrees from truth: height)", "flatness", "verdict")
+    table = table_of(title, columns, numbers=(near, "relief", "flatness"))
     for row in sorted(record["objects"], key=lambda row: -row["within"]):
         minima = ", ".join(f"{minimum['degrees']:+.0f}: {minimum['height']:.2f}" for minimum in row["minima"][:4])
         score = row["ambiguity_score"]
@@ -295,4 +277,12 @@ def overview_table(title: str, record: dict[str, Any]) -> Table:
     for name, key in (("all objects", "within"), ("unique answer", "within_unique_answer")):
         if record[key] is not None:
             table.add_row(name, "", f"{record[key]:.3f}", "", "")
+    return table
+
+
+def table_of(title: str, columns: Sequence[str], numbers: Sequence[str]) -> Table:
+    """An empty table for the terminal; the columns of numbers are to the right."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="right" if column in numbers else "left", no_wrap=True)
     return table

@@ -14,12 +14,14 @@ from rich.console import Console
 from torch import Tensor
 
 from lp_framework.analysis.generated import generated_views
+from lp_framework.analysis.pairs import object_index
+from lp_framework.analysis.shown import words
 from lp_framework.api import image_batch
 from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
 from lp_framework.commands.device import choose_device
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.progress import shown_progress
@@ -48,9 +50,6 @@ def run(config: DictConfig) -> None:
     components = Components(plain(config))
     source = photograph(config) if config.image is not None else data_view(config, components["data"])
     prior: Prior = components["prior"].to(device)
-    (folder / FOLDER).mkdir(exist_ok=True)
-    save_png(folder / "source.png", source.image)
-
     poses = grid(latitudes, longitudes)  # [rows, columns, 3]
     code = prior.encode(image_batch([source.image]).to(device))
     sampling = (config.steps, config.guidance, config.seed, config.eta)
@@ -58,25 +57,30 @@ def run(config: DictConfig) -> None:
         images = generated_views(prior, code, poses.transpose(0, 1).flatten(0, 1), *sampling, batch=len(latitudes))
     views = np.rint(255 * images).astype(np.uint8).reshape(len(longitudes), len(latitudes), *images.shape[1:])
     views = views.swapaxes(0, 1)  # [rows, columns, h, w, 3]
+
+    (folder / FOLDER).mkdir(exist_ok=True)
+    save_png(folder / "source.png", source.image)
+    records = []
     for row, latitude in enumerate(latitudes):
         for column, longitude in enumerate(longitudes):
-            save_png(folder / FOLDER / file_name(latitude, longitude), Image.fromarray(views[row, column]))
-
+            file = f"{FOLDER}/{file_name(latitude, longitude)}"
+            save_png(folder / file, Image.fromarray(views[row, column]))
+            records.append(
+                {
+                    "file": file,
+                    "relative_latitude_degrees": latitude,
+                    "relative_longitude_degrees": round(longitude, 6),
+                    "relative_pose": [round(value, 6) for value in poses[row, column].tolist()],
+                }
+            )
+    record = {"source": str(source.file), "views": records, "seed": config.seed}
+    write_json(folder / "views.json", {**record, "config": plain(config), "versions": versions()})
     settings = f"steps {config.steps}, guidance {config.guidance:g}, eta {config.eta:g}, seed {config.seed}"
-    figure = views_figure(
-        on_white(source.image), views, latitudes, longitudes, source.name, f"prior {config.prior.name}, {settings}"
-    )
+    note = f"prior {config.prior.name}, {settings}"
+    figure = views_figure(on_white(source.image), views, latitudes, longitudes, source.name, note)
     save_figure(figure, folder / "views")
-    record = {
-        "source": str(source.file),
-        "views": records(latitudes, longitudes, poses),
-        "seed": config.seed,
-        "config": plain(config),
-        "versions": versions(),
-    }
-    write_json(folder / "views.json", record)
     console = Console(soft_wrap=True, highlight=False)
-    console.print(f"views:   {folder / FOLDER} ({views.shape[0] * views.shape[1]} files)")
+    console.print(f"views:   {folder / FOLDER} ({len(records)} files)")
     console.print(f"poses:   {folder / 'views.json'}")
     console.print(f"picture: {folder / 'views.png'}")
 
@@ -120,13 +124,8 @@ def data_view(config: DictConfig, data: PairDataModule) -> Source:
     """The first test view of the data set's `object`, as it is."""
     data.evaluate_on("ordered", config.seed)
     data.prepare_data()
-    table = data.table("test")
-    if config.object not in table.names:
-        known = f"{nearest(str(config.object), table.names)} (known: {', '.join(table.names)})"
-        raise UserError(f"data={config.data.name} has no object '{config.object}'{known}")
-    index = table.names.index(config.object)
-    file = table.files[table.views_of(index)[0]]
-    return Source(file, table.names[index].replace("_", " "), prepare(read_image(file), str(file), crop=False))
+    file = data.table("test").objects[object_index(data, str(config.object))].files[0]
+    return Source(file, words(config.object), prepare(read_image(file), str(file), crop=False))
 
 
 def file_name(latitude: float, longitude: float) -> str:
@@ -136,17 +135,3 @@ def file_name(latitude: float, longitude: float) -> str:
     'latitude-20_longitude030.png'
     """
     return f"latitude{latitude:+g}_longitude{longitude:03g}.png"
-
-
-def records(latitudes: Sequence[float], longitudes: Sequence[float], poses: Tensor) -> list[dict[str, object]]:
-    """For every view its file and its pose relative to the source."""
-    return [
-        {
-            "file": f"{FOLDER}/{file_name(latitude, longitude)}",
-            "relative_latitude_degrees": latitude,
-            "relative_longitude_degrees": round(longitude, 6),
-            "relative_pose": [round(value, 6) for value in poses[row, column].tolist()],
-        }
-        for row, latitude in enumerate(latitudes)
-        for column, longitude in enumerate(longitudes)
-    ]

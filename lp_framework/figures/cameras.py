@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lp_framework import registry
-from lp_framework.analysis.azimuth import NEAR_DEGREES
+from lp_framework.analysis.ambiguity import NEAR_DEGREES
 from lp_framework.analysis.pairs import named_pairs, object_index, solved_pairs
 from lp_framework.analysis.shown import ShownPair, words
 from lp_framework.data.module import PairDataModule

@@ -9,8 +9,8 @@ from itertools import permutations
 import torch
 from matplotlib.figure import Figure
 
-from lp_framework.analysis.fields import ExactModel, field_error, model_arrows, model_field
-from lp_framework.analysis.landscapes import Landscape, PoseMap, landscape_grid
+from lp_framework.analysis.fields import ExactModel, field_error, model_arrows, model_landscapes
+from lp_framework.analysis.landscapes import PoseMap, landscape_grid
 from lp_framework.analysis.pairs import named_pairs, object_index, truths
 from lp_framework.analysis.shown import ShownPair
 from lp_framework.data.module import PairDataModule
@@ -45,18 +45,16 @@ class ScoreVsEnergyFigure(PaperFigure[list[ShownPair]]):
     def analyse(self, seed: int, device: torch.device) -> list[ShownPair]:
         """Three maps a pair, at its true relative radius; nothing is drawn at random."""
         pairs, shown = named_pairs(self.data, self.objects, self.places, device)
-        truth, grid = truths(shown), landscape_grid()
+        truth = truths(shown)
         radius = truth[:, 2]
-        energies = model_field(self.energy, pairs, radius, grid).energy
-        assert energies is not None
+        densities = [each.density() for each in model_landscapes(self.energy, pairs, radius, landscape_grid())]
         exact, *learned = (
             model_arrows(model, pairs, radius, SPACING)
             for model in (ExactModel(self.score.kernel, truth), self.energy, self.score)
         )
         found = []
         for number, pair in enumerate(shown):
-            density = Landscape(*grid, radius[number].item(), energies[number].cpu()).density()
-            maps = [PoseMap(density=density)]
+            maps = [PoseMap(density=densities[number])]
             for model, arrows in zip((self.energy, self.score), learned, strict=True):
                 own = arrows[number]._replace(scale=exact[number].longest())
                 maps.append(PoseMap(f"error {self._error(model, pair.object, device):.1%}", arrows=own))

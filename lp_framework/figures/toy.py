@@ -14,7 +14,7 @@ from lp_framework.analysis.fields import (
     arrows,
     grid_poses,
     model_arrows,
-    model_field,
+    model_landscapes,
     prior_field,
     prior_landscapes,
 )
@@ -76,8 +76,7 @@ class ToyFigure(PaperFigure[ToyContents]):
         with shown_progress():
             (landscape,) = prior_landscapes(self.prior, pairs, radius, grid, draws)
             (prior,) = arrows(cells, prior_field(self.prior, pairs, poses.flatten(1, 2), draws).score.view_as(poses))
-        learned = model_field(self.energy, pairs, radius, grid).energy
-        assert learned is not None
+        (learned,) = model_landscapes(self.energy, pairs, radius, grid)
         scale = exact.longest()
         maps = [
             PoseMap("exact score", arrows=exact),
@@ -85,10 +84,7 @@ class ToyFigure(PaperFigure[ToyContents]):
             PoseMap("prior, \u2212\u2207E", arrows=prior),
             PoseMap("energy model, \u2212\u2207E", arrows=energy._replace(scale=scale)),
         ]
-        densities = {
-            "prior, exp(\u2212E)": landscape.density(),
-            "energy model, exp(\u2212E)": landscape._replace(energy=learned[0].cpu()).density(),
-        }
+        densities = {"prior, exp(\u2212E)": landscape.density(), "energy model, exp(\u2212E)": learned.density()}
         return ToyContents(replace(shown[0], maps=maps), densities)
 
     def draw(self, contents: ToyContents) -> Figure:

@@ -11,27 +11,14 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from lp_framework.geometry import camera_to_world
-from lp_framework.viz.style import (
-    ASIDE,
-    BLUE,
-    FAINT,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    PURPLE,
-    VERMILION,
-    Sheet,
-    key,
-    letter,
-    shortened,
-    styled,
-)
+from lp_framework.viz import style
+from lp_framework.viz.style import ASIDE, BLUE, FAINT, INK, MUTED, VERMILION, Sheet, letter, shortened, styled
 
 ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the second relative to the reference
 NEAR_BY = 0.34  # how far from a camera its image is drawn, as a share of the largest radius
@@ -85,10 +72,8 @@ def image_plane(camera: NDArray, distance: float, half_angle: float) -> NDArray:
     `half_angle` is half of its field of view (radians).
     """
     side = distance * math.tan(half_angle)
-    corners = np.array(
-        [[-side, -side, -distance], [side, -side, -distance], [side, side, -distance], [-side, side, -distance]]
-    )
-    return corners @ camera[:3, :3].T + camera[:3, 3]
+    corners = np.array([[-side, -side], [side, -side], [side, side], [-side, side]])
+    return np.c_[corners, np.full(4, -distance)] @ camera[:3, :3].T + camera[:3, 3]
 
 
 def _cameras(poses: NDArray) -> NDArray:
@@ -97,43 +82,53 @@ def _cameras(poses: NDArray) -> NDArray:
     return cameras
 
 
-def _box(view: Viewpoint, points: NDArray, furthest: float, ground: float) -> tuple[NDArray, NDArray]:
-    """Lower left and upper right of what shows points `[K, 3]` and the ground, as wide as `ground` of `furthest`."""
-    seen = view.project(np.concatenate([points, _ring(ground * furthest)]))
-    return seen.min(axis=0) - 0.06 * furthest, seen.max(axis=0) + 0.06 * furthest
-
-
-def _ring(radius: float) -> NDArray:
-    """A circle `[181, 3]` around the object, at latitude 0."""
-    return radius * _directions(np.linspace(0, 2 * math.pi, 181))
-
-
-def _directions(longitude: NDArray) -> NDArray:
-    """Unit vectors `[K, 3]` at latitude 0."""
+def _circle(degrees: range) -> NDArray:
+    """Points `[K, 3]` at distance 1 from the object, at latitude 0."""
+    longitude = np.radians(degrees)
     return np.stack([np.sin(longitude), np.zeros_like(longitude), np.cos(longitude)], axis=-1)
 
 
-def _draw_ground(axes: Axes, view: Viewpoint, radius: float) -> None:
-    """The plane of latitude 0, with a line every 30 degrees of longitude."""
-    axes.add_patch(Polygon(view.project(_ring(radius)), facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
-    axes.add_patch(Polygon(view.project(_ring(radius / 2)), fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
-    ends = view.project(radius * _directions(np.radians(np.arange(0, 360, 30))))
-    axes.add_collection(LineCollection([[(0, 0), end] for end in ends], colors=FAINT, linewidths=0.4, zorder=1.1))
+ROUND, SPOKES = _circle(range(0, 361, 2)), _circle(range(0, 360, 30))
 
 
-def _draw_image(axes: Axes, image: NDArray, corners: NDArray, order: float) -> None:
-    """An image in a parallelogram `[4, 2]` (as `image_plane`); nothing where that is seen edge-on."""
-    right, up = corners[1] - corners[0], corners[3] - corners[0]
-    if abs(right[0] * up[1] - right[1] * up[0]) < 1e-3 * (right @ right + up @ up):
-        return
-    placed = Affine2D.from_values(*right, *up, *corners[0])
-    axes.imshow(image, extent=(0, 1, 0, 1), transform=placed + axes.transData, interpolation="bilinear", zorder=order)
+class Scene:
+    """What is seen of points `[K, 3]` from a viewpoint, and the ground, the plane of latitude 0, out to `radius`."""
 
+    def __init__(self, view: Viewpoint, points: NDArray, radius: float, margin: float) -> None:
+        self.view, self.radius = view, radius
+        seen = view.project(np.concatenate([points, margin * radius * ROUND]))
+        self.low, self.high = seen.min(axis=0) - 0.06 * radius, seen.max(axis=0) + 0.06 * radius
 
-def _draw_frustum(axes: Axes, apex: NDArray, corners: NDArray, **style: Any) -> None:
-    """The edges of a camera's pyramid, from its centre `[2]` to the corners `[4, 2]` of its image."""
-    edges = [np.stack([apex, corner]) for corner in corners] + [np.concatenate([corners, corners[:1]])]
-    axes.add_collection(LineCollection(edges, capstyle="round", joinstyle="round", **style))
+    def height(self, wide: float) -> float:
+        """The height of axes that show it and are so wide."""
+        across, up = self.high - self.low
+        return float(wide * up / across)
+
+    def begin(self, axes: Axes) -> None:
+        """Draw into these axes from now on; the ground, with a line every 30 degrees of longitude, to begin with."""
+        self.axes = axes
+        axes.set(xlim=(self.low[0], self.high[0]), ylim=(self.low[1], self.high[1]), aspect="equal")
+        axes.axis("off")
+        rings = [self.view.project(share * self.radius * ROUND) for share in (1, 0.5)]
+        axes.add_patch(Polygon(rings[0], facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
+        axes.add_patch(Polygon(rings[1], fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
+        spokes = [[(0, 0), end] for end in self.view.project(self.radius * SPOKES)]
+        axes.add_collection(LineCollection(spokes, colors=FAINT, linewidths=0.4, zorder=1.1))
+
+    def image(self, image: NDArray, plane: NDArray, order: float) -> None:
+        """An image in its plane (as `image_plane`); nothing where that is seen edge-on."""
+        corners = self.view.project(plane)
+        right, up = corners[1] - corners[0], corners[3] - corners[0]
+        if abs(right[0] * up[1] - right[1] * up[0]) < 1e-3 * (right @ right + up @ up):
+            return
+        placed = Affine2D.from_values(*right, *up, *corners[0]) + self.axes.transData
+        self.axes.imshow(image, extent=(0, 1, 0, 1), transform=placed, interpolation="bilinear", zorder=order)
+
+    def frustum(self, centre: NDArray, plane: NDArray, **line: Any) -> None:
+        """The edges of a camera's pyramid, from its centre to its image's plane."""
+        apex, corners = self.view.project(centre), self.view.project(plane)
+        edges = [np.stack([apex, corner]) for corner in corners] + [np.concatenate([corners, corners[:1]])]
+        self.axes.add_collection(LineCollection(edges, capstyle="round", joinstyle="round", **line))
 
 
 def shrunk(image: NDArray) -> NDArray:
@@ -167,14 +162,13 @@ def cameras_figure(
     The first is the reference; its image also stands for the object, as a cut-out in the middle. Below the scene are
     the images (the first `MOST_CARDS`) with their poses.
     """
-    cameras, view, half_angle = _cameras(poses), best_viewpoint(poses), math.radians(field_of_view_degrees) / 2
-    furthest = float(poses[:, 2].max())
+    cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())
     middle = image_plane(cameras[0], float(poses[0, 2]), half_angle)  # through the object's centre
     distance = furthest * (NEAR_BY if len(poses) <= 5 else 0.8 * NEAR_BY)
     planes = [image_plane(camera, distance, half_angle) for camera in cameras]
-    low, high = _box(view, np.concatenate([middle, *planes, cameras[:, :3, 3]]), furthest, ground=1.14)
-    tall = min(TALLEST, WIDTH * (high[1] - low[1]) / (high[0] - low[0]))
-    cards = min(len(images), MOST_CARDS)
+    points = np.concatenate([middle, *planes, cameras[:, :3, 3]])
+    scene = Scene(best_viewpoint(poses), points, furthest, margin=1.14)
+    tall, cards = min(TALLEST, scene.height(WIDTH)), min(len(images), MOST_CARDS)
     side = (WIDTH - 2 * SIDE - GAP * (CARD_COLUMNS - 1)) / CARD_COLUMNS
     rows = math.ceil(cards / CARD_COLUMNS)
     columns = math.ceil(cards / rows)
@@ -183,24 +177,21 @@ def cameras_figure(
     sheet.head("Cameras around the object")
     more = f"; below, {cards} of {len(images)} images" if len(images) > cards else ""
     sheet.text(WIDTH - SIDE, 0.12, f"{numbers[0]} is the reference{more}", va="top", ha="right", **ASIDE)
-    scene = sheet.axes(0, TOP, WIDTH, tall)
-    _draw_ground(scene, view, furthest)
-    for degrees, place in zip(range(0, 360, 90), _directions(np.radians(np.arange(0, 360, 90))), strict=True):
-        x, y = view.project(1.09 * furthest * place)
-        scene.text(x, y, f"{degrees}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
-    _draw_image(scene, images[0], view.project(middle), order=100.0)
+    scene.begin(sheet.axes(0, TOP, WIDTH, tall))
+    for place, (x, y) in enumerate(scene.view.project(1.09 * furthest * SPOKES[::3])):
+        scene.axes.text(x, y, f"{90 * place}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
+    scene.image(images[0], middle, order=100.0)
     for index, (camera, plane) in enumerate(zip(cameras, planes, strict=True)):
-        order = 100.0 + 10 * float(view.nearness(camera[:3, 3])) / furthest
-        _draw_camera(scene, view, camera[:3, 3], plane, shrunk(images[index]), order, _colour(index))
-        _write_number(scene, view.project(camera[:3, 3]), numbers[index], 200.0, _colour(index))
-    scene.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    scene.axis("off")
+        _draw_camera(scene, camera[:3, 3], plane, shrunk(images[index]), _colour(index))
+        _write_number(scene.axes, scene.view.project(camera[:3, 3]), numbers[index], 200.0, _colour(index))
 
     for index in range(cards):
         row, column = divmod(index, columns)
         x = (WIDTH - columns * (side + GAP) + GAP) / 2 + column * (side + GAP)
         y = TOP + tall + row * (side + TEXT)
-        sheet.image(x, y, side, _on_white(images[index]), color=_colour(index), linewidth=1.0)
+        alpha = images[index][..., 3:] / 255
+        on_white = np.rint(images[index][..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
+        sheet.image(x, y, side, on_white, color=_colour(index), linewidth=1.0)
         below = sheet.axes(x, y + side, side, TEXT)
         below.set(xlim=(0, side), ylim=(TEXT, 0))  # one data unit is an inch
         below.axis("off")
@@ -213,22 +204,16 @@ def _colour(index: int) -> str:
     return BLUE if index == 0 else VERMILION
 
 
-def _on_white(image: NDArray) -> NDArray:
-    alpha = image[..., 3:] / 255
-    return np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-
-
-def _draw_camera(
-    axes: Axes, view: Viewpoint, centre: NDArray, plane: NDArray, image: NDArray, order: float, colour: str
-) -> None:
+def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: NDArray, colour: str) -> None:
     """A pyramid from the camera's centre to its image, its line of sight, and its height above the ground."""
-    apex, corners = view.project(centre), view.project(plane)
-    height, sight = (np.stack([apex, view.project(end)], axis=1) for end in (centre * [1, 0, 1], 0 * centre))
-    axes.plot(*height, color=MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
-    axes.plot(*sight, color=colour, linewidth=0.7, linestyle=(0, (2, 3)), zorder=3)
-    axes.add_patch(Polygon(corners, facecolor="white", edgecolor="none", alpha=0.65, zorder=order))
-    _draw_image(axes, image, corners, order + 0.1)
-    _draw_frustum(axes, apex, corners, colors=colour, linewidths=[0.7] * 4 + [1.0], zorder=order + 0.2)
+    order = 100.0 + 10 * float(scene.view.nearness(centre)) / scene.radius
+    height, sight = (scene.view.project(np.stack([centre, end])).T for end in (centre * [1, 0, 1], 0 * centre))
+    scene.axes.plot(*height, color=MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
+    scene.axes.plot(*sight, color=colour, linewidth=0.7, linestyle=(0, (2, 3)), zorder=3)
+    corners = scene.view.project(plane)
+    scene.axes.add_patch(Polygon(corners, facecolor="white", edgecolor="none", alpha=0.65, zorder=order))
+    scene.image(image, plane, order + 0.1)
+    scene.frustum(centre, plane, colors=colour, linewidths=[0.7] * 4 + [1.0], zorder=order + 0.2)
 
 
 def _write_number(axes: Axes, place: NDArray, number: int, order: float, colour: str) -> None:
@@ -251,13 +236,13 @@ def _write_card(axes: Axes, title: str, pose: NDArray) -> None:
 # ---------------------------------------------------------------- the cameras that methods predict
 
 RED, SKY = "#D7191C", "#56B4E9"
-TARGETS = (BLUE, ORANGE, GREEN, PURPLE, SKY, MUTED)  # a colour a target view
+TARGETS = (BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, MUTED)  # a colour a target view
 FRUSTUM = 0.2  # of the largest radius
 # True cameras are wide and light, so that a predicted one on them can be seen.
 TRUE: dict[str, Any] = {"linewidth": 2.4, "alpha": 0.55}
 PREDICTED: dict[str, Any] = {"linewidth": 0.9}
 # Inches: the figure's width, the column of images, room for titles and for the key, gaps.
-METHODS_WIDTH, IMAGES, TITLE, KEY, BETWEEN = 7.0, 2.0, 0.22, 0.26, 0.05
+METHODS_WIDTH, IMAGES, TITLE, KEY, BETWEEN, APART = 7.0, 2.0, 0.22, 0.26, 0.05, 0.08
 IMAGE_COLUMNS = 3
 IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
 
@@ -277,60 +262,56 @@ class CameraScene(NamedTuple):
 
 
 @styled
-def camera_methods_figure(scenes: Sequence[CameraScene], methods: Sequence[str], field_of_view: float) -> Figure:
+def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str], field_of_view: float) -> Figure:
     """A row an object: its images, the reference framed in red, and a scene a method. `field_of_view` in radians.
 
     The true cameras are bold, the predicted ones thin.
     """
-    wide = (METHODS_WIDTH - 2 * SIDE - IMAGES - 0.08 * len(methods)) / len(methods)
+    wide = (METHODS_WIDTH - 2 * SIDE - IMAGES - APART * len(methods)) / len(methods)
     rows = []
-    for scene in scenes:
-        view, lines = best_viewpoint(scene.poses), math.ceil(len(scene.images) / IMAGE_COLUMNS)
-        centres = _cameras(np.concatenate([scene.poses, *(each.reshape(-1, 3) for each in scene.predicted)]))[:, :3, 3]
-        low, high = _box(view, centres, float(scene.poses[:, 2].max()), ground=1.12)
-        images = lines * IMAGE + (lines - 1) * BETWEEN
-        rows.append((scene, view, low, high, images, max(wide * (high[1] - low[1]) / (high[0] - low[0]), images)))
-    sheet = Sheet(METHODS_WIDTH, KEY + sum(tall + TITLE + 0.08 for *_, tall in rows))
+    for each in objects:
+        points = _cameras(np.concatenate([each.poses, *(poses.reshape(-1, 3) for poses in each.predicted)]))[:, :3, 3]
+        scene = Scene(best_viewpoint(each.poses), points, float(each.poses[:, 2].max()), margin=1.12)
+        images = math.ceil(len(each.images) / IMAGE_COLUMNS) * (IMAGE + BETWEEN) - BETWEEN
+        rows.append((each, scene, images, max(scene.height(wide), images)))
+    sheet = Sheet(METHODS_WIDTH, KEY + sum(tall + TITLE + APART for *_, tall in rows))
     top = TITLE
-    for row, (scene, view, low, high, images, tall) in enumerate(rows):
-        sheet.above(SIDE, top, f"(a) {scene.title}" if row == 0 else scene.title)
-        for index, image in enumerate(scene.images):
+    for row, (each, scene, images, tall) in enumerate(rows):
+        sheet.above(SIDE, top, f"(a) {each.title}" if row == 0 else each.title)
+        for index, image in enumerate(each.images):
             line, column = divmod(index, IMAGE_COLUMNS)
             x, y = SIDE + column * (IMAGE + BETWEEN), top + (tall - images) / 2 + line * (IMAGE + BETWEEN)
             sheet.image(x, y, IMAGE, image, color=colour_of(index), linewidth=1.4)
-        for number, (poses, word) in enumerate(zip(scene.predicted, scene.words, strict=True)):
-            x = SIDE + IMAGES + 0.08 + number * (wide + 0.08)
-            axes = sheet.axes(x, top, wide, tall)
-            _draw_scene(axes, scene, poses, view, field_of_view / 2)
-            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-            axes.axis("off")
+        for number, (poses, word) in enumerate(zip(each.predicted, each.words, strict=True)):
+            x = SIDE + IMAGES + APART + number * (wide + APART)
+            scene.begin(sheet.axes(x, top, wide, tall))
+            _draw_method(scene, each, poses, field_of_view / 2)
             if row == 0:
                 sheet.above(x, top, letter(number + 1, methods[number]))
             sheet.above(x + wide, top, word, ha="right", **ASIDE)
-        top += tall + TITLE + 0.08
+        top += tall + TITLE + APART
     keys = [
-        key("reference", color=RED, linestyle="-", **TRUE),
-        key("true cameras, a colour a view", color=INK, linestyle="-", **TRUE),
-        key("predicted, one for each start", color=INK, linestyle="-", **PREDICTED),
+        Line2D([], [], color=RED, label="reference", **TRUE),
+        Line2D([], [], color=INK, label="true cameras, a colour a view", **TRUE),
+        Line2D([], [], color=INK, label="predicted, one for each start", **PREDICTED),
     ]
-    sheet.legend(keys, METHODS_WIDTH - SIDE, sheet.height - 0.18, columnspacing=1.6, handlelength=1.8)
+    sheet.legend(
+        keys, METHODS_WIDTH - SIDE, sheet.height - 0.18, columnspacing=1.6, handlelength=1.8, handletextpad=0.8
+    )
     return sheet.figure
 
 
-def _draw_scene(axes: Axes, scene: CameraScene, predicted: NDArray, view: Viewpoint, half_angle: float) -> None:
-    furthest, cameras = float(scene.poses[:, 2].max()), _cameras(scene.poses)
-    _draw_ground(axes, view, furthest)
-    middle = image_plane(cameras[0], float(scene.poses[0, 2]), half_angle)
-    _draw_image(axes, shrunk(scene.cutout), view.project(middle), order=10.0)
+def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray, half_angle: float) -> None:
+    """The cut-out in the middle, the true cameras and those predicted, `[V - 1, N, 3]`."""
+    cameras = _cameras(content.poses)
+    scene.image(shrunk(content.cutout), image_plane(cameras[0], float(content.poses[0, 2]), half_angle), order=10.0)
 
-    def draw(camera: NDArray, kind: str, index: int, order: float, **style: Any) -> None:
-        corners = view.project(image_plane(camera, FRUSTUM * furthest, half_angle))
-        _draw_frustum(
-            axes, view.project(camera[:3, 3]), corners, color=colour_of(index), zorder=order, gid=kind, **style
-        )
+    def draw(camera: NDArray, kind: str, index: int, order: float, **line: Any) -> None:
+        plane = image_plane(camera, FRUSTUM * scene.radius, half_angle)
+        scene.frustum(camera[:3, 3], plane, color=colour_of(index), zorder=order, gid=kind, **line)
 
     for index, camera in enumerate(cameras):
-        draw(camera, "true" if index else "reference", index, 20.0 + float(view.nearness(camera[:3, 3])), **TRUE)
+        draw(camera, "true" if index else "reference", index, 20.0 + float(scene.view.nearness(camera[:3, 3])), **TRUE)
     for index, poses in enumerate(predicted):
         for camera in _cameras(poses):
             draw(camera, "predicted", index + 1, 30.0, **PREDICTED)

@@ -16,7 +16,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter, StrMe
 from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLD
-from lp_framework.viz.style import CLASS_COLOURS, FAINT, INK, MUTED, Sheet, key, open_frame, shortened, styled
+from lp_framework.viz.style import CLASS_COLOURS, FAINT, INK, MUTED, Sheet, open_frame, shortened, styled
 
 MOST_OBJECTS = 42  # on a contact sheet
 NEAREST = 0.01  # scene units; where the logarithmic axis of translation errors begins
@@ -67,17 +67,17 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
         "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * np.square(x))
     )
     left.set(xlim=(0, 180), ylim=(0, 1.005), ylabel="share of pairs within the error")
-    left.xaxis.set_major_locator(FixedLocator([0, *ROTATION_THRESHOLDS, 60, 90, 120, 180]))
-    left.xaxis.set_minor_locator(NullLocator())
-    left.xaxis.set_major_formatter(StrMethodFormatter("{x:g}°"))
     left.set_xlabel("rotation error (square-root scale)")
     left.yaxis.set_major_formatter(PercentFormatter(1.0))
     right.set_xscale("log")
     right.set(xlim=(NEAREST, 4), xlabel="translation error (object sizes, log scale)")
-    right.xaxis.set_major_locator(FixedLocator([0.01, 0.05, TRANSLATION_THRESHOLD, 1, 4]))
-    right.xaxis.set_minor_locator(NullLocator())
-    right.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    for axes, thresholds in ((left, ROTATION_THRESHOLDS), (right, (TRANSLATION_THRESHOLD,))):
+    for axes, thresholds, others, unit in (
+        (left, ROTATION_THRESHOLDS, (0, 60, 90, 120, 180), "°"),
+        (right, (TRANSLATION_THRESHOLD,), (0.01, 0.05, 1, 4), ""),
+    ):
+        axes.xaxis.set_major_locator(FixedLocator(sorted([*thresholds, *others])))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}" + unit))
         open_frame(axes)
         for threshold in thresholds:
             axes.axvline(threshold, color=MUTED, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
@@ -113,10 +113,9 @@ def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
         x, y = 0.1 + column * card, top + row * (side + text)
         sheet.image(x, y, side, each.image)
         _write_card(sheet.axes(x, y + side, side, text), each, side)
-    present = {each.ambiguity for each in shown}
-    keys = [
-        key(name, marker="s", markersize=5, color=colour) for name, colour in CLASS_COLOURS.items() if name in present
-    ]
+    mark: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 5}
+    present = [name for name in CLASS_COLOURS if name in {each.ambiguity for each in shown}]
+    keys = [Line2D([], [], color=CLASS_COLOURS[name], label=name, **mark) for name in present]
     sheet.legend(keys, 7.9, 0.08, columnspacing=1.2, handletextpad=0.2)
     return sheet.figure
 

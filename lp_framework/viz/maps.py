@@ -17,42 +17,25 @@ from numpy.typing import NDArray
 
 from lp_framework.analysis.landscapes import FLAT, Landscape, LandscapeMinimum, PoseMap, Ways
 from lp_framework.analysis.shown import ShownPair
-from lp_framework.viz.style import (
-    ANSWER,
-    DENSITY,
-    FAINT,
-    INK,
-    MAGNITUDE,
-    MUTED,
-    OTHERS,
-    TRUTH,
-    Sheet,
-    degrees,
-    key,
-    styled,
-)
+from lp_framework.viz.style import ANSWER, DENSITY, FAINT, INK, MAGNITUDE, MUTED, OTHERS, TRUTH, Sheet, degrees, styled
 
 SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it
 # From dark valleys to light heights, evenly in lightness, so that grey and any kind of colour vision see the same.
 RELIEF = "cividis"
 LEVELS = 9  # contour lines
-TRUTH_MARK: dict[str, Any] = {
-    "marker": "*", "markersize": 14, "markerfacecolor": TRUTH, "markeredgecolor": INK, "markeredgewidth": 0.8,
-}  # fmt: skip
-CHOSEN_MARK: dict[str, Any] = {
-    "marker": "D", "markersize": 5, "markerfacecolor": ANSWER, "markeredgecolor": "white", "markeredgewidth": 0.8,
-}  # fmt: skip
-END_MARK: dict[str, Any] = {
-    "marker": "o", "markersize": 4, "markerfacecolor": OTHERS, "markeredgecolor": "white", "markeredgewidth": 0.6,
-}  # fmt: skip
-START_MARK: dict[str, Any] = {
-    "marker": "o", "markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": OTHERS, "markeredgewidth": 1.0,
-}  # fmt: skip
-MINIMUM_MARK: dict[str, Any] = {
-    "marker": "+", "markersize": 9, "markeredgecolor": "white", "markeredgewidth": 1.3,
-    "path_effects": [withStroke(linewidth=2.5, foreground=INK)],
-}  # fmt: skip
 ALONG = "longitude of the query relative to the reference"
+
+
+def _mark(marker: str, size: float, face: str, edge: str, width: float, **others: Any) -> dict[str, Any]:
+    style = {"markersize": size, "markerfacecolor": face, "markeredgecolor": edge, "markeredgewidth": width}
+    return {"linestyle": "none", "marker": marker, **style, **others}
+
+
+TRUTH_MARK = _mark("*", 14, TRUTH, INK, 0.8)
+CHOSEN_MARK = _mark("D", 5, ANSWER, "white", 0.8)
+END_MARK = _mark("o", 4, OTHERS, "white", 0.6)
+START_MARK = _mark("o", 4.5, "white", OTHERS, 1.0)
+MINIMUM_MARK = _mark("+", 9, INK, "white", 1.3, path_effects=[withStroke(linewidth=2.5, foreground=INK)])
 
 
 # ---------------------------------------------------------------- one map
@@ -83,7 +66,7 @@ def draw_map(
         low, high = (math.degrees(content.relief.latitude[end].item()) for end in (0, -1))
         for minimum in marked_minima(content.relief):
             place = math.degrees(minimum.longitude), math.degrees(minimum.latitude)
-            axes.plot(*place, linestyle="none", zorder=2, **MINIMUM_MARK)
+            axes.plot(*place, zorder=2, **MINIMUM_MARK)
     if content.arrows is not None:
         scale = greatest if greatest is not None else content.arrows.scale or content.arrows.longest() or 1.0
         if scale > 0:
@@ -141,7 +124,7 @@ def _points(axes: Axes, poses: NDArray, limit: float, **mark: Any) -> None:
     # What lies on the seam is on both edges of the map, and none of its mark is cut off there.
     for shift in (0.0, 360.0, -360.0):
         shown = (np.abs(latitude) <= limit) & (np.abs(longitude + shift - 180) <= 180 + SEAM)
-        axes.plot(longitude[shown] + shift, latitude[shown], linestyle="none", clip_on=False, **mark)
+        axes.plot(longitude[shown] + shift, latitude[shown], clip_on=False, **mark)
 
 
 def broken_at_seam(latitude: NDArray, longitude: NDArray) -> tuple[NDArray, NDArray]:
@@ -195,7 +178,7 @@ def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
         (any(each.starts is not None and len(each.starts) > 0 for each in ways), "start", START_MARK),
         (any(each.relief and marked_minima(each.relief) for each in maps), "local minimum", MINIMUM_MARK),
     ]
-    return [key(label, **mark) for shown, label, mark in entries if shown]
+    return [Line2D([], [], label=label, **mark) for shown, label, mark in entries if shown]
 
 
 # ---------------------------------------------------------------- pages
@@ -224,7 +207,7 @@ def _place_bar(sheet: Sheet, drawn: ScalarMappable | None, x: float, y: float, t
     assert drawn is not None
     axes = sheet.axes(x + 0.12, y, 0.1, tall)
     sheet.figure.colorbar(drawn, cax=axes).set_label(label)
-    axes.locator_params(axis="y", nbins=5)
+    axes.locator_params(axis="y", nbins=6)
     axes.spines[:].set_visible(False)
 
 
@@ -302,12 +285,8 @@ def field_figure(pair: ShownPair, title: str, note: str) -> Figure:
 
 
 def captions(pair: ShownPair) -> list[str]:
-    """For every end of a pair the longitude of its start, and how far off it is, as far as they are known.
-
-    The parts are those of `start_names` and `errors_in_words`.
-    """
-    parts = zip(start_names(pair), errors_in_words(pair), strict=True)
-    return [": ".join(filter(None, each)) for each in parts]
+    """For every end of a pair the longitude of its start, and how far off it is, as far as they are known."""
+    return [": ".join(filter(None, each)) for each in zip(start_names(pair), errors_in_words(pair), strict=True)]
 
 
 def start_names(pair: ShownPair) -> list[str]:

@@ -27,35 +27,7 @@ TRUTH, ANSWER, OTHERS = "#FFC20A", VERMILION, "#3A3A3A"
 MAGNITUDE = LinearSegmentedColormap.from_list("magnitude", ["#C9DDEC", "#7FB2D9", "#3F86BE", "#0B4A86", "#062B57"])
 DENSITY = LinearSegmentedColormap.from_list("density", ["#FFFFFF", "#E9E4DA", "#CFC4AE"])
 
-SETTINGS: Any = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # matplotlib brings it, so figures are alike everywhere
-    "font.size": 8,
-    "axes.titlesize": 8.5,
-    "axes.titlelocation": "left",
-    "axes.labelsize": 8,
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "text.color": INK,
-    "text.parse_math": False,  # names of objects may hold a dollar sign
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "legend.fontsize": 7.5,
-    "legend.frameon": False,
-    "lines.linewidth": 1.5,
-    "pdf.fonttype": 42,  # text stays text
-    "savefig.facecolor": "white",
-}
+SETTINGS = matplotlib.rc_params_from_file(Path(__file__).with_name("look.mplstyle"), use_default_template=False)
 
 _Parameters = ParamSpec("_Parameters")
 
@@ -114,7 +86,8 @@ class Sheet:
     def head(self, title: str, note: str = "") -> None:
         """The title of the whole, and a note below it."""
         self.text(0.1, 0.1, title, fontsize=10, fontweight="bold", va="top")
-        self.text(0.1, 0.3, note, color=MUTED, va="top")
+        if note:
+            self.text(0.1, 0.3, note, color=MUTED, va="top")
 
     def above(self, x: float, y: float, text: str, **style: Any) -> None:
         """A line above a place, by default the title of a panel."""
@@ -145,11 +118,6 @@ def open_frame(axes: Axes) -> None:
     """Only the left and bottom edge, and a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color=FAINT, linewidth=0.4)
-
-
-def key(label: str, **style: Any) -> Line2D:
-    """An entry of a key; a mark unless the style says otherwise."""
-    return Line2D([], [], label=label, **{"linestyle": "none", **style})
 
 
 def letter(number: int, title: str) -> str:

@@ -56,7 +56,7 @@ def draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None = Non
     if truth is not None:
         place = math.degrees(truth[1]) % 360, math.degrees(truth[0])
         axes.plot(*([each, each] for each in place), [floor, low + relief], color=INK, linewidth=0.8, zorder=10)
-        axes.plot(*([each] for each in place), [floor], linestyle="none", zorder=11, **TRUTH_MARK)
+        axes.plot(*([each] for each in place), [floor], zorder=11, **TRUTH_MARK)
     axes.view_init(elev=32, azim=-62)
     axes.set_box_aspect((2.0, 1.15, 0.95), zoom=1.04)
     axes.tick_params(pad=-2)
