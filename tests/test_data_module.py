@@ -75,8 +75,8 @@ def files_of(table) -> set[Path]:
     return set(table.files)
 
 
-def pairs_of(loader) -> list[int]:
-    return [number for batch in loader for number in batch.pairs.tolist()]
+def pairs_of(loader) -> list[list[int]]:
+    return [pair for batch in loader for pair in batch.pairs.tolist()]
 
 
 # ---------------------------------------------------------------- splits
@@ -252,20 +252,19 @@ def test_nothing_is_printed_where_there_is_no_terminal(make, capfd):
 # ---------------------------------------------------------------- epochs
 
 
-def numbers(table, protocol: str = "ordered") -> list[int]:
-    pairs = table.pairs(protocol)
-    return sorted(table.pair_number(pairs[:, 0], pairs[:, 1]).tolist())
+def wanted(table, protocol: str = "ordered") -> list[list[int]]:
+    return sorted(table.pairs(protocol).tolist())
 
 
 def test_training_goes_through_all_ordered_pairs_of_the_training_views(make):
     data = make()
     loader = data.train_dataloader()
-    assert sorted(pairs_of(loader)) == numbers(data.table("train"))
+    assert sorted(pairs_of(loader)) == wanted(data.table("train"))
     assert len(list(loader)) == len(loader) > 1
 
 
 def test_epochs_of_training_differ_and_repeat_by_seed(make):
-    def epoch(number: int, seed: int = 0) -> list[int]:
+    def epoch(number: int, seed: int = 0) -> list[list[int]]:
         loader = make(seed=seed).train_dataloader()
         loader.sampler.set_epoch(number)
         return pairs_of(loader)
@@ -276,7 +275,7 @@ def test_epochs_of_training_differ_and_repeat_by_seed(make):
 
 def test_validation_goes_through_all_ordered_pairs_in_one_order(make):
     data = make()
-    assert sorted(pairs_of(data.val_dataloader())) == numbers(data.table("validation"))
+    assert sorted(pairs_of(data.val_dataloader())) == wanted(data.table("validation"))
     assert pairs_of(data.val_dataloader()) == pairs_of(make().val_dataloader())
 
 
@@ -285,7 +284,7 @@ def test_evaluation_goes_through_the_test_views(make, protocol):
     data = make()
     data.evaluate_on(protocol, seed=0)
     loader = data.test_dataloader()
-    assert sorted(pairs_of(loader)) == numbers(data.table("test"), protocol)
+    assert sorted(pairs_of(loader)) == wanted(data.table("test"), protocol)
     for batch in loader:
         assert batch.pixels is not None and len(batch) <= EVALUATION_PAIRS
         reference, query = batch.poses[batch.reference], batch.poses[batch.query]
@@ -298,22 +297,26 @@ def test_ifusions_pairs_are_of_the_first_five_training_views_on_disk(make, root)
         data = make(seed=seed)
         data.evaluate_on("ifusion", seed=0)
         loader = data.test_dataloader()
-        views = {view for number in pairs_of(loader) for view in divmod(number, len(loader.dataset.table))}
+        views = {view for pair in pairs_of(loader) for view in pair}
         assert {loader.dataset.table.files[view] for view in views} == expected
+
+
+def distinct(shares: list[list[list[int]]]) -> list[list[int]]:
+    return sorted({tuple(pair): pair for pair in itertools.chain(*shares)}.values())
 
 
 @pytest.mark.parametrize("world", [2, 3])
 def test_processes_share_the_pairs_out(make, world):
-    shares: dict[str, list[list[int]]] = {"train": [], "validation": [], "evaluation": []}
+    shares: dict[str, list[list[list[int]]]] = {"train": [], "validation": [], "evaluation": []}
     for rank in range(world):
         data = make()
         data.trainer = SimpleNamespace(global_rank=rank, world_size=world)
         shares["train"].append(pairs_of(data.train_dataloader()))
         shares["validation"].append(pairs_of(data.val_dataloader()))
         shares["evaluation"].append(pairs_of(data.test_dataloader()))
-    assert sorted(itertools.chain(*shares["train"])) == numbers(data.table("train"))
-    assert set(itertools.chain(*shares["validation"])) == set(numbers(data.table("validation")))
-    assert set(itertools.chain(*shares["evaluation"])) == set(numbers(data.table("test")))
+    assert sorted(itertools.chain(*shares["train"])) == wanted(data.table("train"))
+    assert distinct(shares["validation"]) == wanted(data.table("validation"))
+    assert distinct(shares["evaluation"]) == wanted(data.table("test"))
 
 
 # ---------------------------------------------------------------- data sets that are rendered

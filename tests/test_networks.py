@@ -46,9 +46,11 @@ def batch(views: int = 4, seed: int = 0) -> PairBatch:
     first, second = torch.meshgrid(torch.arange(views), torch.arange(views), indexing="ij")
     reference, query = first[first != second], second[first != second]
     return PairBatch(
-        pixels=torch.randint(256, (views, 8, 8, 3), generator=generator, dtype=torch.uint8), features=None, poses=poses,
+        pixels=torch.randint(256, (views, 8, 8, 3), generator=generator, dtype=torch.uint8), features=None,
+        names=[f"cup/{view}" for view in range(views)], poses=poses,
         cameras=camera_to_world(poses), objects=torch.zeros(views, dtype=torch.long),
-        reference=reference, query=query, pairs=reference * views + query,
+        reference=reference, query=query, pairs=torch.stack([reference, query], dim=1),
+        numbers=reference * views + query,
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from lp_framework.data.pairs import (
     Rows,
     ViewTable,
     as_images,
+    in_batches,
 )
 from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
@@ -124,9 +125,7 @@ def test_a_misspelt_protocol():
 
 def ids_by_names(table: ViewTable) -> dict[tuple[str, str], int]:
     pairs = table.pairs("ordered")
-    numbers = torch.from_numpy(table.pair_number(pairs[:, 0], pairs[:, 1]))
-    assert len(numbers.unique()) == len(pairs)
-    ids = table.pair_ids(numbers)
+    ids = PairData(table, None, None)[pairs].ids
     assert ids.dtype == torch.int64 and len(ids.unique()) == len(pairs) and (ids >= 0).all()
     return {(str(table.files[r]), str(table.files[q])): id for (r, q), id in zip(pairs, ids.tolist(), strict=True)}
 
@@ -139,16 +138,17 @@ def test_pair_ids_depend_on_the_pair_alone():
 def test_pair_ids_follow_the_pairs_in_any_order():
     table = table_of(3, 4)
     pairs = table.pairs("ordered")
-    numbers = torch.from_numpy(table.pair_number(pairs[:, 0], pairs[:, 1]))
-    order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))
-    assert torch.equal(table.pair_ids(numbers[order]), table.pair_ids(numbers)[order])
+    data = PairData(table, None, None)
+    order = np.random.default_rng(0).permutation(len(pairs))
+    assert torch.equal(data[pairs[order]].ids, data[pairs].ids[order])
 
 
 def test_pair_ids_do_not_depend_on_where_the_data_lies():
     here, there = views_of("a", 3), views_of("a", 3)
     moved = ObjectViews("a", "test", "unlabelled", None, [Path("/x") / f for f in there.files], there.cameras, 0.8)
-    number = torch.tensor([1, 5])
-    assert torch.equal(ViewTable([here]).pair_ids(number), ViewTable([moved]).pair_ids(number))
+    pairs = np.array([[0, 1], [1, 2]])
+    batches = [PairData(ViewTable([views]), None, None)[pairs] for views in (here, moved)]
+    assert torch.equal(batches[0].ids, batches[1].ids)
 
 
 # ---------------------------------------------------------------- blocks
@@ -254,7 +254,7 @@ def test_an_object_with_one_view_cannot_be_trained_on():
 @given(st.integers(1, 60), st.integers(1, 25), st.integers(1, 5))
 def test_a_list_goes_through_in_order_with_repeats_at_the_end_only(count, batch_pairs, ranks):
     pairs = np.arange(2 * count).reshape(count, 2)
-    samplers = [ListSampler(pairs, batch_pairs, rank, ranks) for rank in range(ranks)]
+    samplers = [ListSampler(in_batches(pairs, batch_pairs), rank, ranks) for rank in range(ranks)]
     assert len({len(sampler) for sampler in samplers}) == 1
     assert all(len(list(sampler)) == len(sampler) for sampler in samplers)
     in_turn = [batch for turn in zip(*samplers, strict=True) for batch in turn]
@@ -288,7 +288,8 @@ def test_a_batch_has_each_view_once_and_points_to_it(data):
             assert torch.equal(batch.poses[side], data.table.poses[torch.from_numpy(pairs[:, column])])
             assert torch.equal(batch.objects[side], data.table.object_of_view[torch.from_numpy(pairs[:, column])])
         assert torch.equal(batch.objects[batch.reference], batch.objects[batch.query])
-        assert batch.pairs.tolist() == [r * len(data.table) + q for r, q in listed(pairs)]
+        assert batch.pairs.tolist() == pairs.tolist()
+        assert batch.names == [data.table.view_names[view] for view in views]
 
 
 def test_relative_poses_are_the_true_ones(data):

@@ -152,7 +152,7 @@ def overview(
     places = torch.arange(azimuths) * (2 * math.pi / azimuths)
     energies, truth, objects = [], [], []
     for batch in tracked(list(data.test_dataloader()), "energies around the objects"):
-        poses, pairs = batch.relative_poses(), pairs_of(batch, table, device)
+        poses, pairs = batch.relative_poses(), pairs_of(batch, device)
         energies.append(azimuth_energies(prior, pairs, poses.to(device), places, draws).cpu())
         truth.append(poses[:, 1])
         objects.append(batch.objects[batch.reference])
@@ -165,7 +165,7 @@ def overview(
         curve = profile(energy[mask], places, longitude[mask])
         batch = batches[per_view[table.views_of(number)[:PAIRS]]]
         true = batch.relative_poses()
-        landscapes = prior_landscapes(prior, pairs_of(batch, table, device), true[:, 2], grid, draws)
+        landscapes = prior_landscapes(prior, pairs_of(batch, device), true[:, 2], grid, draws)
         rows.append(
             {
                 "object": table.names[number], "ambiguity": table.ambiguities[number],

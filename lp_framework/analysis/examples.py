@@ -81,7 +81,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     objects, answer = rows["object"].numpy(), rotation[np.arange(len(rotation)), chosen]
     picks = pick_examples(answer, objects, table.names, table.unique_answer)
     numbers = [pick.row for pick in picks]
-    views = np.array([divmod(int(pair), len(table)) for pair in rows["pair"][numbers]])
+    views = rows["pair"][numbers].numpy()
     pairs, shown = shown_pairs(data, views, evaluation.device, [pick.reason for pick in picks])
     starts = evaluation.starts.make(pairs, evaluation.seed)
     solver, sets = evaluation.solver, isinstance(evaluation, ViewSetEvaluation)

@@ -59,7 +59,7 @@ def shown_pairs(
         reason = "" if reasons is None else reasons[place]
         truth = batch.relative_poses()[place].numpy()
         shown.append(ShownPair(table.names[index], table.ambiguities[index], reason, reference, query, truth))
-    return pairs_of(batch, table, device), shown
+    return pairs_of(batch, device), shown
 
 
 def named_pairs(

@@ -46,7 +46,7 @@ def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
     """So many of the ordered pairs of views, spread evenly over the objects."""
     every = views.table.pairs("ordered")
     chosen = every[np.linspace(0, len(every), min(count, len(every)), endpoint=False, dtype=int)]
-    return pairs_of(views[chosen], views.table, device)
+    return pairs_of(views[chosen], device)
 
 
 def measure(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -14,7 +15,16 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from lp_framework.data.cache import cached_array, content_key, decoded_views, tracked
-from lp_framework.data.pairs import BlockSampler, ListSampler, PairBatch, PairData, Rows, ViewTable, as_images
+from lp_framework.data.pairs import (
+    BlockSampler,
+    ListSampler,
+    PairBatch,
+    PairData,
+    Rows,
+    ViewTable,
+    as_images,
+    in_batches,
+)
 from lp_framework.data.views import ObjectViews, object_names, read_views
 from lp_framework.errors import UserError
 
@@ -63,7 +73,7 @@ class PairDataModule(LightningDataModule):
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images a set, where sets are evaluated
         self._evaluation_pairs = EVALUATION_PAIRS
-        self._left_out = np.empty(0, dtype=np.int64)
+        self._left_out: set[tuple[int, int]] = set()
         self._folders: dict[str, list[ObjectViews]] = {}
         self._tables: dict[str, ViewTable] = {}
         self._image_keys: dict[str, str] = {}
@@ -128,12 +138,12 @@ class PairDataModule(LightningDataModule):
             raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
         self._evaluation, self._views, self._evaluation_pairs = ("view_sets", 0), views, batch_pairs
 
-    def leave_out(self, pairs: NDArray[np.int64]) -> None:
-        """From now on `test_dataloader` leaves out the batches all of whose pairs are among these, by number.
+    def leave_out(self, pairs: Iterable[Sequence[int]]) -> None:
+        """From now on `test_dataloader` leaves out the batches all of whose pairs (rows of the table) are among these.
 
         The other batches stay as they are, so that what is computed of them stays the same to the last bit.
         """
-        self._left_out = pairs
+        self._left_out = {(reference, query) for reference, query in pairs}
 
     def evaluation_split(self) -> str:
         """The split that the protocol of `evaluate_on` takes its pairs from."""
@@ -187,7 +197,7 @@ class PairDataModule(LightningDataModule):
         if not self.validation_views:
             return []
         data = self.data("validation")
-        return self._listed(data, data.table.pairs("ordered"), self.batch_pairs)
+        return self._listed(data, in_batches(data.table.pairs("ordered"), self.batch_pairs))
 
     def test_dataloader(self) -> DataLoader[PairBatch]:
         """The pairs or sets to evaluate on that were chosen, by default all ordered pairs of the test views."""
@@ -195,21 +205,16 @@ class PairDataModule(LightningDataModule):
         if self._views is not None:
             sets = data.table.view_sets(self._views)
             pairs = np.stack([np.repeat(sets[:, :1], self._views - 1, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
-            sets_at_once = max(1, self._evaluation_pairs // (self._views - 1))
-            return self._remaining(data, pairs, sets_at_once * (self._views - 1))
-        protocol, seed = self._evaluation or ("ordered", 0)
-        return self._remaining(data, data.table.pairs(protocol, seed), self._evaluation_pairs)
+            count = max(1, self._evaluation_pairs // (self._views - 1)) * (self._views - 1)
+        else:
+            pairs, count = data.table.pairs(*(self._evaluation or ("ordered", 0))), self._evaluation_pairs
+        batches = [
+            each for each in in_batches(pairs, count) if not self._left_out.issuperset(map(tuple, each.tolist()))
+        ]
+        return self._listed(data, batches)
 
-    def _remaining(self, data: PairData, pairs: NDArray[np.int64], batch_pairs: int) -> DataLoader[PairBatch]:
-        """The pairs in batches, without those of `leave_out`."""
-        out = np.isin(data.table.pair_number(pairs[:, 0], pairs[:, 1]), self._left_out)
-        whole = np.logical_and.reduceat(
-            out, np.arange(0, len(pairs), batch_pairs)
-        )  # of each batch, whether all are out
-        return self._listed(data, pairs[~np.repeat(whole, batch_pairs)[: len(pairs)]], batch_pairs)
-
-    def _listed(self, data: PairData, pairs: NDArray[np.int64], batch_pairs: int) -> DataLoader[PairBatch]:
-        return DataLoader(data, batch_size=None, sampler=ListSampler(pairs, batch_pairs, *self._ranks()))
+    def _listed(self, data: PairData, batches: Sequence[NDArray[np.int64]]) -> DataLoader[PairBatch]:
+        return DataLoader(data, batch_size=None, sampler=ListSampler(batches, *self._ranks()))
 
 
 def _folder(split: str) -> str:

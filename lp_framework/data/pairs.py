@@ -23,22 +23,32 @@ PROTOCOLS = ("ordered", "per_view", "ifusion")
 class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
-    `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, D]` that a frozen backbone computed from them; `poses` `[I, 3]`
-    view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`; `reference`, `query` `[P]` into the
-    views; `pairs` `[P]` indices of the pairs in the data set.
+    `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, D]` that a frozen backbone computed from them; `names` of the
+    views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`;
+    `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table, `numbers` `[P]` a
+    number for each ordered pair of rows.
     """
 
     pixels: Tensor | None
     features: Tensor | None
+    names: list[str]
     poses: Tensor
     cameras: Tensor
     objects: Tensor
     reference: Tensor
     query: Tensor
     pairs: Tensor
+    numbers: Tensor
 
     def __len__(self) -> int:
         return len(self.reference)
+
+    @property
+    def ids(self) -> Tensor:
+        """Integers `[P]` that name the pairs for good: hashes of the views' names, whatever else the data set holds."""
+        pairs = zip(self.reference.tolist(), self.query.tolist(), strict=True)
+        ids = [stable_id(f"{self.names[reference]} {self.names[query]}") for reference, query in pairs]
+        return torch.tensor(ids, dtype=torch.int64, device=self.reference.device)
 
     @property
     def images(self) -> Tensor:
@@ -60,6 +70,7 @@ class ViewTable:
         self.ambiguities = [views.ambiguity for views in objects]
         self.unique_answer = [views.unique_answer for views in objects]
         self.files = [file for views in objects for file in views.files]
+        self.view_names = [f"{views.name}/{file.name}" for views in objects for file in views.files]
         self.cameras = torch.cat([views.cameras for views in objects])
         self.poses = torch.cat([views.poses for views in objects])
         self.counts = [len(views) for views in objects]
@@ -72,17 +83,6 @@ class ViewTable:
     def views_of(self, index: int) -> NDArray[np.int64]:
         """Numbers of the views of object `index`."""
         return np.arange(self._starts[index], self._starts[index + 1])
-
-    def pair_number(self, reference: NDArray[np.int64], query: NDArray[np.int64]) -> NDArray[np.int64]:
-        """A number for each ordered pair of views, unique in the table."""
-        return reference * len(self) + query
-
-    def pair_ids(self, numbers: Tensor) -> Tensor:
-        """Ids `[P]` of pairs by number: hashes of object and image names, the same whatever else the table holds."""
-        pairs = [divmod(number, len(self)) for number in numbers.tolist()]
-        views = {view for pair in pairs for view in pair}
-        names = {view: f"{self.names[self.object_of_view[view]]}/{self.files[view].name}" for view in views}
-        return torch.tensor([stable_id(f"{names[r]} {names[q]}") for r, q in pairs])
 
     def pairs(self, protocol: str = "ordered", seed: int = 0) -> NDArray[np.int64]:
         """Ordered pairs `[P, 2]` (reference, query) by a named protocol.
@@ -158,12 +158,14 @@ class PairData(Dataset[PairBatch]):
         return PairBatch(
             pixels=pixels,
             features=features,
+            names=[self.table.view_names[view] for view in views],
             poses=self.table.poses[index],
             cameras=self.table.cameras[index],
             objects=self.table.object_of_view[index],
             reference=torch.from_numpy(place[:, 0]),
             query=torch.from_numpy(place[:, 1]),
-            pairs=torch.from_numpy(self.table.pair_number(pairs[:, 0], pairs[:, 1])),
+            pairs=torch.from_numpy(pairs),
+            numbers=torch.from_numpy(pairs[:, 0] * len(self.table) + pairs[:, 1]),
         )
 
 
@@ -239,15 +241,19 @@ def _within(views: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([first, second], axis=1)[first != second]
 
 
-class ListSampler(Sampler[NDArray[np.int64]]):
-    """Given pairs `[P, 2]` in order, in batches of `batch_pairs`, shared out over processes.
+def in_batches(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+    """Pairs `[P, 2]` in order, `count` at a time."""
+    return [pairs[start : start + count] for start in range(0, len(pairs), count)]
 
-    Processes get equally many batches; where the number does not divide, the last ones repeat earlier batches, and
-    the metrics count a pair once.
+
+class ListSampler(Sampler[NDArray[np.int64]]):
+    """Given batches of pairs `[P, 2]` in order, shared out over processes.
+
+    Processes get equally many; where the number does not divide, the last ones repeat earlier batches, and the metrics
+    count a pair once.
     """
 
-    def __init__(self, pairs: NDArray[np.int64], batch_pairs: int, rank: int = 0, ranks: int = 1) -> None:
-        batches = [pairs[start : start + batch_pairs] for start in range(0, len(pairs), batch_pairs)]
+    def __init__(self, batches: Sequence[NDArray[np.int64]], rank: int = 0, ranks: int = 1) -> None:
         rounds = -(-len(batches) // ranks)
         self.batches = [batches[(step * ranks + rank) % len(batches)] for step in range(rounds)]
 

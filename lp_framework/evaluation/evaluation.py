@@ -64,8 +64,8 @@ class Evaluation(LightningModule):
         if not found:
             return
         pairs = torch.cat([batch.pair for batch in found])
-        data.leave_out(pairs.numpy())
-        self.print(f"going on: {len(pairs.unique())} pairs have been solved before")
+        data.leave_out(pairs.tolist())
+        self.print(f"going on: {len(pairs.unique(dim=0))} pairs have been solved before")
         # Each process has some, since a metric without any cannot be gathered.
         for batch in found[self.trainer.global_rank :: self.trainer.world_size] or found[:1]:
             self.count(batch)
@@ -82,7 +82,7 @@ class Evaluation(LightningModule):
 
     def solve(self, batch: PairBatch) -> Solution:
         """The solver's solution of a batch's pairs."""
-        pairs = pairs_of(batch, self.table, self.device)
+        pairs = pairs_of(batch, self.device)
         return self.solver.solve(pairs, self.starts.make(pairs, self.seed), self.seed)
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:

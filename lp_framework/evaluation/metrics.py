@@ -20,7 +20,7 @@ STATES = ("pair", "object", "rotation", "translation", "chosen", "answer")
 class SolvedBatch(NamedTuple):
     """What is kept of a batch of P pairs from N starts: what `PoseMetrics.update` takes, and what the batch took."""
 
-    pair: Tensor  # [P] int64
+    pair: Tensor  # [P, 2] int64, rows of reference and query in the view table
     object: Tensor  # [P] int64
     rotation: Tensor  # [P, N] float64, degrees
     translation: Tensor  # [P, N] float64, scene units
@@ -109,8 +109,8 @@ class PoseMetrics(Metric):
     def update(
         self, pair: Tensor, object: Tensor, rotation: Tensor, translation: Tensor, chosen: Tensor, answer: Tensor
     ) -> None:
-        """Add pairs numbered `[P]` of objects `[P]`: errors `[P, N]` (degrees, scene units), chosen start `[P]` and its
-        relative pose `[P, 3]`.
+        """Add pairs `[P, 2]` (rows of views) of objects `[P]`: errors `[P, N]` (degrees, scene units), chosen start
+        `[P]` and its relative pose `[P, 3]`.
         """
         for state, value in zip(STATES, (pair, object, rotation, translation, chosen, answer), strict=True):
             getattr(self, state).append(value)
@@ -121,7 +121,7 @@ class PoseMetrics(Metric):
         self._all_rows = None
 
     def rows(self) -> dict[str, Tensor]:
-        """One row a pair, by ascending pair number, each pair once; of all processes once `compute` has run."""
+        """One row a pair, by ascending reference and query, each pair once; of all processes once `compute` has run."""
         return self._gathered() if self._all_rows is None else self._all_rows
 
     def _gathered(self) -> dict[str, Tensor]:
@@ -167,11 +167,11 @@ class Costs(Metric):
 
     def __init__(self, **arguments: Any) -> None:
         super().__init__(**arguments)
-        self.add_state("batch", [], dist_reduce_fx="cat")  # the number of its first pair
+        self.add_state("batch", [], dist_reduce_fx="cat")  # its first pair
         self.add_state("cost", [], dist_reduce_fx="cat")  # pairs, seconds, passes
 
     def update(self, pair: Tensor, seconds: float, passes: int) -> None:
-        """Add a batch of pairs numbered `[P]`."""
+        """Add a batch of pairs `[P, 2]`."""
         self.batch.append(pair[:1])
         self.cost.append(torch.tensor([[len(pair), seconds, passes]], dtype=torch.float64, device=pair.device))
 

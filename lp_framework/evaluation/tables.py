@@ -119,7 +119,7 @@ def pair_rows(metrics: PoseMetrics, table: ViewTable) -> list[list[object]]:
     rows = metrics.rows()
     lines: list[list[object]] = []
     for line in range(len(rows["pair"])):
-        reference, query = divmod(int(rows["pair"][line]), len(table))
+        reference, query = rows["pair"][line].tolist()
         index, chosen = int(rows["object"][line]), int(rows["chosen"][line])
         latitude, longitude, radius = rows["answer"][line].tolist()
         errors = [round(float(rows[key][line, chosen]), 5) for key in ("rotation", "translation")]

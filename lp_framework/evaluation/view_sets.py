@@ -25,7 +25,7 @@ class ViewSetEvaluation(Evaluation):
 
     def solve(self, batch: PairBatch) -> Solution:
         """The sets' solution, as one of the pairs of each first image with the others."""
-        pairs = pairs_of(batch, self.table, self.device)
+        pairs = pairs_of(batch, self.device)
         ids = pairs.ids.view(-1, self.others)
         views = torch.cat([pairs.reference.view_as(ids)[:, :1], pairs.query.view_as(ids)], dim=1)
         view_sets = ViewSets(pairs.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0])

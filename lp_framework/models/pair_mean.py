@@ -11,16 +11,14 @@ from torchmetrics.utilities import dim_zero_cat
 
 
 def first_of_each(pairs: Tensor) -> Tensor:
-    """Positions `[U]` of the first occurrence of each number in `pairs` `[P]`, by ascending number.
+    """Positions `[U]` of the first occurrence of each pair in `[P]` (numbers) or `[P, 2]` (rows), in ascending order.
 
     >>> first_of_each(torch.tensor([7, 3, 7]))
     tensor([1, 0])
     """
-    order = torch.argsort(pairs, stable=True)
-    ranked = pairs[order]
-    new = torch.ones_like(ranked, dtype=torch.bool)
-    new[1:] = ranked[1:] != ranked[:-1]
-    return order[new]
+    unique, place = torch.unique(pairs, dim=0, return_inverse=True)
+    first = torch.full((len(unique),), len(pairs), device=pairs.device)
+    return first.scatter_reduce(0, place, torch.arange(len(pairs), device=pairs.device), "amin")
 
 
 class PairMean(Metric):

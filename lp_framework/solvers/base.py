@@ -10,7 +10,7 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor, nn
 
-from lp_framework.data.pairs import PairBatch, ViewTable
+from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError
 from lp_framework.keyed_random import keyed_bits
 
@@ -36,11 +36,10 @@ class Pairs:
         return len(self.reference)
 
 
-def pairs_of(batch: PairBatch, table: ViewTable, device: torch.device) -> Pairs:
-    """The pairs of a batch of the views in `table`, on a device. The batch has images: nothing caches features."""
-    ids = table.pair_ids(batch.pairs).to(device)
+def pairs_of(batch: PairBatch, device: torch.device) -> Pairs:
+    """The pairs of a batch, on a device. The batch has images: nothing caches features."""
     batch = move_data_to_device(batch, device)
-    return Pairs(batch.images, batch.reference, batch.query, ids)
+    return Pairs(batch.images, batch.reference, batch.query, batch.ids)
 
 
 @dataclass(frozen=True)
