@@ -43,6 +43,7 @@ from lp_framework.benchmarks.second_stage import (
 from lp_framework.commands.bench import MEASUREMENTS, paper_seconds, table
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
+from lp_framework.data.source import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
 from lp_framework.models.checkpoints import SHIPPED, load_model
@@ -213,7 +214,7 @@ def test_seconds_are_those_of_one_step_of_all_starts(steps, monkeypatch):
 def views(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loaders")
     write_objects(folder / "views", train=6)
-    data = PairDataModule(str(folder / "views"), str(folder / "cache"), 16, 36, 3, 0, 0)
+    data = PairDataModule(RenderingsData(str(folder / "views")), str(folder / "cache"), 16, 36, 3, 0)
     return data.data("train")
 
 

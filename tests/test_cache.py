@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from view_folders import draw_view, random_poses, write_object
 
-from lp_framework.data.cache import cached_array, content_key, decoded_views
+from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views
 from lp_framework.errors import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -20,14 +20,15 @@ TRUTH = np.arange(105, dtype=np.float32).reshape(SHAPE)
 
 
 class Fill:
-    """Fills in the truth and counts how often."""
+    """Gives the truth, in two blocks, and counts how often."""
 
     def __init__(self) -> None:
         self.calls = 0
 
-    def __call__(self, array) -> None:
+    def __call__(self):
         self.calls += 1
-        array[:] = TRUTH
+        yield TRUTH[:2]
+        yield TRUTH[2:]
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def fill() -> Fill:
 @pytest.fixture
 def array(tmp_path, fill):
     """`array()` asks the cache for the truth."""
-    return lambda: cached_array(tmp_path / "cache", "key", SHAPE, np.float32, fill)
+    return lambda: cached_array(tmp_path / "cache", "key", len(TRUTH), fill)
 
 
 @pytest.fixture
@@ -74,14 +75,25 @@ def test_an_array_is_filled_once_and_then_mapped(array, fill, tmp_path):
 
 def test_keys_are_kept_apart(tmp_path, fill):
     for key in ("a", "b", "a"):
-        np.testing.assert_array_equal(cached_array(tmp_path, key, SHAPE, np.float32, fill), TRUTH)
+        np.testing.assert_array_equal(cached_array(tmp_path, key, len(TRUTH), fill), TRUTH)
     assert fill.calls == 2
 
 
-def test_another_shape_or_type_under_the_key_is_made_anew(array, tmp_path):
+@pytest.mark.parametrize("dtype", [np.uint8, np.float16, np.int64, bool])
+@pytest.mark.parametrize("shape", [(), (9,), (2, 3, 1, 2)])
+def test_arrays_of_any_shape_and_type_are_kept(tmp_path, shape, dtype):
+    blocks = [np.ones((count, *shape), dtype) for count in (1, 3)]
+    for _ in range(2):
+        kept = cached_array(tmp_path, "key", 4, lambda: blocks)
+        assert kept.shape == (4, *shape) and kept.dtype == dtype and kept.all()
+
+
+def test_another_number_of_rows_under_the_key_is_made_anew(array, tmp_path):
     array()
-    wider = cached_array(tmp_path / "cache", "key", (2, 9), np.uint8, lambda out: out.fill(7))
+    wider = cached_array(tmp_path / "cache", "key", 2, lambda: [np.full((2, 9), 7, np.uint8)])
     assert wider.shape == (2, 9) and wider.dtype == np.uint8 and (wider == 7).all()
+    with pytest.raises(ValueError, match="the blocks of key have 2 rows, 3 are wanted"):
+        cached_array(tmp_path / "cache", "key", 3, lambda: [np.full((2, 9), 7, np.uint8)])
 
 
 def npy(tmp_path: Path) -> Path:
@@ -149,12 +161,12 @@ def test_leftovers_of_a_killed_run_are_no_hindrance(array, fill, tmp_path):
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_a_fill_that_fails_half_way_leaves_nothing(array, fill, tmp_path, error):
-    def half(out) -> None:
-        out[0] = TRUTH[0]
+    def half():
+        yield TRUTH[:1]
         raise error
 
     with pytest.raises(error):
-        cached_array(tmp_path / "cache", "key", SHAPE, np.float32, half)
+        cached_array(tmp_path / "cache", "key", len(TRUTH), half)
     assert [path.name for path in (tmp_path / "cache").iterdir() if path.suffix != ".lock"] == []
     np.testing.assert_array_equal(array(), TRUTH)
     assert fill.calls == 1
@@ -164,12 +176,12 @@ def test_a_rebuild_that_fails_does_not_spoil_what_others_have_mapped(array, tmp_
     mapped = array()
     note(tmp_path).write_text("garbage")
 
-    def half(out) -> None:
-        out[0] = -1
+    def half():
+        yield -TRUTH[:1]
         raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        cached_array(tmp_path / "cache", "key", SHAPE, np.float32, half)
+        cached_array(tmp_path / "cache", "key", len(TRUTH), half)
     np.testing.assert_array_equal(mapped, TRUTH)
     array()
     np.testing.assert_array_equal(mapped, TRUTH)
@@ -178,14 +190,14 @@ def test_a_rebuild_that_fails_does_not_spoil_what_others_have_mapped(array, tmp_
 # ---------------------------------------------------------------- disks
 
 
-def test_a_full_disk_is_a_user_error_before_anything_is_computed(array, fill, tmp_path, monkeypatch):
+def test_a_full_disk_is_a_user_error_before_more_than_a_block_is_computed(array, fill, tmp_path, monkeypatch):
     def full(*_arguments: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
     with pytest.raises(UserError, match=r"cache: the cache cannot be written \(No space left.*data\.cache=FOLDER"):
         array()
-    assert fill.calls == 0
+    assert fill.calls == 1
     assert [path.name for path in (tmp_path / "cache").iterdir() if path.suffix != ".lock"] == []
     monkeypatch.undo()
     np.testing.assert_array_equal(array(), TRUTH)
@@ -206,18 +218,20 @@ def test_a_cache_has_its_disk_space_before_it_is_filled(tmp_path):
         pytest.skip("this system cannot reserve disk space")
     reserved = []
 
-    def look(out) -> None:
+    def look():
+        yield np.zeros((1, 1000), np.uint8)
         (partial,) = tmp_path.glob("*.partial.npy")
         reserved.append(partial.stat().st_blocks * 512)
+        yield np.zeros((999, 1000), np.uint8)
 
-    cached_array(tmp_path, "key", (1000, 1000), np.uint8, look)
+    cached_array(tmp_path, "key", 1000, look)
     assert reserved[0] >= 1_000_000  # a sparse file has next to nothing, and its pages meet a full disk with SIGBUS
 
 
 def test_a_folder_that_cannot_be_made(tmp_path, fill):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UserError, match=r"file/cache: the cache cannot be written"):
-        cached_array(tmp_path / "file" / "cache", "key", SHAPE, np.float32, fill)
+        cached_array(tmp_path / "file" / "cache", "key", len(TRUTH), fill)
 
 
 # ---------------------------------------------------------------- processes
@@ -230,14 +244,15 @@ def process(tmp_path: Path, fill_body: str) -> subprocess.Popen:
         import numpy as np
         from lp_framework.data.cache import cached_array
 
-        def fill(array):
+        def fill():
             with open("fills", "a") as log:
                 log.write("x")
-            array[0] = np.arange(35).reshape(5, 7)
+            whole = np.arange(105, dtype=np.float32).reshape(3, 5, 7)
+            yield whole[:1]
             {fill_body}
-            array[:] = np.arange(105).reshape(3, 5, 7)
+            yield whole[1:]
 
-        print(cached_array("cache", "key", (3, 5, 7), np.float32, fill).sum())
+        print(cached_array("cache", "key", 3, fill).sum())
     """
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
@@ -353,6 +368,34 @@ def test_a_transparent_pixels_colour_does_not_bleed_into_smaller_views(tmp_path)
     Image.fromarray(pixels).save(tmp_path / "000.png")
     _, images = decoded_views([tmp_path / "000.png"], 8, tmp_path / "cache")
     assert (images[0, :, :4] == [200, 0, 0]).all() and (images[0, :, 4:] == 255).all()
+
+
+# ---------------------------------------------------------------- opacity and depth
+
+
+def test_alpha_is_the_files_own_and_shrinks_as_the_views_do(files, tmp_path):
+    key, _ = decoded_views(files, 16, tmp_path / "cache")
+    alpha = decoded_alpha(files, 16, tmp_path / "cache", key)
+    np.testing.assert_array_equal(alpha, [np.asarray(Image.open(file))[..., 3] for file in files])
+    key, half = decoded_views(files, 8, tmp_path / "half")
+    alpha = decoded_alpha(files, 8, tmp_path / "half", key)
+    assert alpha.shape == (5, 8, 8) and alpha.dtype == np.uint8
+    assert (half[alpha == 0] == 255).all() and ((alpha > 0) & (alpha < 255)).any()
+
+
+def test_depths_lie_beside_the_views_and_are_taken_at_the_nearest_sample(files, tmp_path):
+    levels = np.arange(256, dtype=np.uint16).reshape(16, 16) * 257
+    with pytest.raises(UserError, match=r"depth/000\.png: there is no such file; .*data\.depth=true"):
+        decoded_depths(files, 16, tmp_path / "cache")
+    (files[0].parents[1] / "depth").mkdir()
+    for shift, file in enumerate(files):
+        Image.fromarray(np.roll(levels, shift)).save(file.parents[1] / "depth" / file.name)
+    depths = decoded_depths(files, 16, tmp_path / "cache")
+    assert depths.shape == (5, 16, 16) and depths.dtype == np.float32
+    np.testing.assert_allclose(depths[0], levels * 1e-4, rtol=1e-6)
+    np.testing.assert_allclose(depths[3], np.roll(levels, 3) * 1e-4, rtol=1e-6)
+    half = decoded_depths(files, 8, tmp_path / "cache")
+    assert set(np.unique(half)) <= set(np.unique(depths))
 
 
 # ---------------------------------------------------------------- images that are none

@@ -45,9 +45,8 @@ def root(tmp_path) -> Path:
 @pytest.fixture
 def make(root, tmp_path):
     def build(**changes) -> CO3DData:
-        settings = {"scenes": 1, "train_views": 8, "test_views": 3, "resolution": 64, "image_size": 32}
-        views, cache = str(tmp_path / "views"), str(tmp_path / "cache")
-        return CO3DData(str(root), **{"views": views, "cache": cache, "validation_views": 0, **settings, **changes})
+        settings = {"scenes": 1, "train_views": 8, "test_views": 3, "resolution": 64}
+        return CO3DData(str(root), **{"views": str(tmp_path / "views"), **settings, **changes})
 
     return build
 
@@ -118,13 +117,10 @@ def test_cameras_on_a_vertical_arc_do_not_tell_up(tmp_path):
 def test_views_keep_the_true_relative_poses_but_for_up_and_scale(tmp_path, cloud, residual, spread):
     assert registry.get("data", "co3d") is CO3DData
     root = write_category(tmp_path / "co3d", cloud=cloud)
-    settings = {"scenes": 1, "train_views": 8, "test_views": 3, "resolution": 64, "image_size": 32}
-    data = CO3DData(
-        str(root), str(tmp_path / "views"), cache=str(tmp_path / "cache"), validation_views=0, **settings
-    )  # fmt: skip
-    data.prepare_data()
+    data = CO3DData(str(root), str(tmp_path / "views"), scenes=1, train_views=8, test_views=3, resolution=64)
+    data.prepare()
     assert data.names() == [f"hydrant-{SEQUENCE}"]
-    assert data.table("train").counts == [8] and data.table("test").counts == [3]
+    assert [len(data.views(data.names()[0], split)) for split in ("train", "test")] == [8, 3]
     truth, found = [], []
     for split in ("train", "test"):
         frames = json.loads((tmp_path / "views" / data.names()[0] / split / "transform.json").read_text())["frames"]
@@ -159,7 +155,7 @@ def test_views_keep_the_true_relative_poses_but_for_up_and_scale(tmp_path, cloud
 def test_sequences_without_scores_or_a_cloud(make, root, tmp_path):
     (_, annotation) = json.loads(gzip.decompress((root / "hydrant" / "sequence_annotations.jgz").read_bytes()))
     write_sequences(root, [{**annotation, "point_cloud": None, "viewpoint_quality_score": math.nan}])
-    make().prepare_data()
+    make().prepare()
     record = json.loads((tmp_path / "views" / f"hydrant-{SEQUENCE}" / "conversion.json").read_text())
     assert record["object_frame"] == "silhouettes"
     assert record["viewpoint_quality_score"] is None is record["point_cloud_quality_score"]
@@ -167,7 +163,7 @@ def test_sequences_without_scores_or_a_cloud(make, root, tmp_path):
 
 def test_a_cloud_that_does_not_agree_with_the_silhouettes_is_not_used(make, root, tmp_path):
     trimesh.PointCloud(10 * box_points().numpy()).export(root / "hydrant" / SEQUENCE / "pointcloud.ply")
-    make().prepare_data()
+    make().prepare()
     record = json.loads((tmp_path / "views" / f"hydrant-{SEQUENCE}" / "conversion.json").read_text())
     assert record["object_frame"] == "silhouettes"
 
@@ -197,10 +193,10 @@ def test_truncated_frames_are_left_out_and_the_download_is_left_alone(make, root
     Image.new("RGB", SIZE).save(mask.parents[1] / "images" / "frame000007.jpg")  # as the challenge's targets are
     before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
     with pytest.warns(UserWarning, match="1 all black, 1 cut off by the image, 1 with an empty mask are left out"):
-        make().prepare_data()
+        make().prepare()
     assert {file: file.read_bytes() for file in root.rglob("*") if file.is_file()} == before
     with pytest.raises(UserError, match=r"has 11 usable views \(1 all black, 1 cut off by the image, 1 with"):
-        make(views=str(tmp_path / "more"), train_views=12).prepare_data()
+        make(views=str(tmp_path / "more"), train_views=12).prepare()
 
 
 # ---------------------------------------------------------------- bad input
@@ -277,7 +273,7 @@ CLOUD = Path("hydrant", SEQUENCE, "pointcloud.ply")
 def test_damaged_data(make, root, tmp_path, damage, message):
     damage(root)
     with pytest.raises(UserError, match=message) as caught:
-        make().prepare_data()
+        make().prepare()
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "views").glob("*hydrant*"))
 

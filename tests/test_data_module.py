@@ -12,11 +12,12 @@ from PIL import Image
 from view_folders import write_object, write_objects
 
 from lp_framework import registry
-from lp_framework.data import sources
-from lp_framework.data.module import EVALUATION_PAIRS
+from lp_framework.data.module import EVALUATION_PAIRS, PairDataModule
 from lp_framework.data.pairs import as_images
-from lp_framework.data.rendering.renderer import Renderer
-from lp_framework.data.sources import MeshData, RenderingsData, ToyData
+from lp_framework.data.rendering.renderer import Renderer, View
+from lp_framework.data.sets import rendered
+from lp_framework.data.sets.rendered import MeshData, ToyData
+from lp_framework.data.source import RenderingsData, ViewSource
 from lp_framework.errors import UserError
 from lp_framework.geometry import relative_pose
 
@@ -31,9 +32,9 @@ def root(tmp_path) -> Path:
 def make(root, tmp_path):
     """`make(seed=1)`: the data module of that folder, with small settings."""
 
-    def build(**changes) -> RenderingsData:
+    def build(**changes) -> PairDataModule:
         settings = {"image_size": 16, "batch_pairs": 40, "block": 3, "validation_views": 4, "seed": 0, **changes}
-        return RenderingsData(str(root), cache=str(tmp_path / "cache"), **settings)
+        return PairDataModule(RenderingsData(str(root)), cache=str(tmp_path / "cache"), **settings)
 
     return build
 
@@ -53,8 +54,6 @@ def opened(monkeypatch) -> list[Path]:
 
 class Means:
     """Stands for a frozen backbone: the mean colour times a weight; counts the images it is shown."""
-
-    trunk_dim = 3
 
     def __init__(self, weight: float = 1.0) -> None:
         self.weight, self.shown = weight, 0
@@ -126,7 +125,9 @@ def test_without_validation_all_views_train(make, root):
 
 def test_too_few_views_to_hold_some_out(make):
     assert make(validation_views=10).table("train").counts == [2] * 3
-    with pytest.raises(UserError, match=r"object 'cup' has 12 training views; holding out data\.validation_views=11"):
+    with pytest.raises(
+        UserError, match=r"object 'cup' has 12 training views; holding out data\.validation_views=11 needs at least 13"
+    ):
         make(validation_views=11).table("train")
 
 
@@ -152,6 +153,25 @@ def test_a_broken_image_is_named_before_training(make, root):
     file.write_bytes(file.read_bytes()[:50])
     with pytest.raises(UserError, match=r"vase/train/rgb/003\.png: is not a readable image"):
         make().prepare_data()
+
+
+def test_whole_objects_can_be_held_out_for_validation(make, root):
+    data = make(validation_objects=1)
+    train, validation = data.table("train"), data.table("validation")
+    assert len(validation.names) == 1 and validation.counts == [4]
+    assert sorted([*train.names, *validation.names]) == ["cup", "tram", "vase"] and train.counts == [12, 12]
+    assert files_of(validation) < set(root.glob(f"{validation.names[0]}/train/rgb/*.png"))
+    assert data.table("all_train").counts == [12] * 3 and data.table("test").counts == [4] * 3
+    drawn = {tuple(make(validation_objects=1, seed=seed).table("validation").names) for seed in range(9)}
+    assert len(drawn) > 1 and make(validation_objects=1).table("validation").names == validation.names
+    before = make(validation_objects=2).table("validation").names
+    write_object(root, "zebra", train=12, test=4)  # another object takes the place of one of them at most
+    assert len(set(before) & set(make(validation_objects=2).table("validation").names)) >= 1
+    assert make(validation_objects=2, validation_views=12).table("validation").counts == [12] * 2
+    with pytest.raises(UserError, match=r"data\.validation_objects=4 of 4 objects leave none to train on"):
+        make(validation_objects=4).table("train")
+    with pytest.raises(UserError, match=r"validation_views must be at least 2.* with data\.validation_objects=1"):
+        make(validation_objects=1, validation_views=0)
 
 
 # ---------------------------------------------------------------- what is decoded and computed
@@ -200,10 +220,33 @@ def test_features_are_computed_once_and_are_the_backbones(make):
     assert extractor.shown == 3 * (12 + 4)
 
 
+def test_batches_carry_alpha_and_depth_where_they_are_asked_for(make, root, opened):
+    plain = make()
+    batch = next(iter(plain.val_dataloader()))
+    assert batch.alpha is None is batch.depth
+    for file in root.glob("*/train/rgb/*.png"):
+        depth = file.parents[1] / "depth"
+        depth.mkdir(exist_ok=True)
+        Image.fromarray(np.full((16, 16), 10_000 + int(file.stem), np.uint16)).save(depth / file.name)
+    data = make()
+    data.carry("alpha", "depth")
+    data.prepare_data()
+    before = len(opened)
+    for loader in (data.train_dataloader(), data.val_dataloader()):
+        for batch in loader:
+            assert batch.alpha.dtype == torch.uint8 and batch.depth.dtype == torch.float32
+            assert batch.alpha.shape == batch.depth.shape == batch.pixels.shape[:3]
+            assert (batch.pixels[batch.alpha == 0] == 255).all()
+            numbers = torch.tensor([float(name.split("/")[1][:3]) for name in batch.names])
+            torch.testing.assert_close(batch.depth[:, 0, 0], 1 + numbers * 1e-4)
+    assert len(opened) == before  # all of it was decoded when it was prepared
+    data.cache_features(Means())
+    batch = next(iter(data.val_dataloader()))
+    assert batch.pixels is None and batch.alpha is not None and batch.depth is not None
+
+
 class Moving(torch.nn.Module):
     """A backbone that is really moved, if only to another type; its head is to be trained afterwards."""
-
-    trunk_dim = 3
 
     def __init__(self) -> None:
         super().__init__()
@@ -240,6 +283,26 @@ def test_features_belong_to_the_weights_and_the_images(make):
     data.cache_features(first)
     data.data("test")
     assert first.shown == 2 * 3 * 4
+
+
+class Patches(Means):
+    """Features of another shape and type: a token for every quarter of the image, in half precision."""
+
+    def trunk(self, images: torch.Tensor) -> torch.Tensor:
+        return images.unflatten(2, (2, -1)).unflatten(4, (2, -1)).mean(dim=(3, 5)).flatten(2).mT.half()
+
+    def fingerprint(self) -> str:
+        return "patches"
+
+
+def test_features_may_have_any_shape_and_type(make):
+    data = make()
+    data.cache_features(Patches())
+    pairs = data.table("test").pairs("ordered")
+    features = data.data("test")[pairs].features
+    assert features.dtype == torch.float16
+    torch.testing.assert_close(features, Patches().trunk(make().data("test")[pairs].images), rtol=0, atol=1e-3)
+    assert features.shape[1:] == (4, 3)
 
 
 def test_nothing_is_printed_where_there_is_no_terminal(make, capfd):
@@ -333,7 +396,7 @@ class Grey(Renderer):
     def views(self, scene, camera_to_world, resolution, field_of_view_degrees):
         for _ in camera_to_world:
             self.drawn += 1
-            yield np.full((resolution, resolution, 4), 200, np.uint8)
+            yield View(np.full((resolution, resolution, 4), 200, np.uint8))
 
 
 @pytest.fixture
@@ -350,10 +413,10 @@ def meshes(tmp_path) -> Path:
 
 @pytest.fixture
 def mesh_data(meshes, tmp_path):
-    """`mesh_data()`: the data module of that folder."""
+    """`mesh_data()`: the views of that folder."""
 
     def build(renderer: Renderer | None = None, path: Path = meshes, **changes) -> MeshData:
-        settings = {"resolution": 8, "image_size": 8, "test_views": 2, "workers": 1, "cache": str(tmp_path / "cache")}
+        settings = {"resolution": 8, "test_views": 2, "workers": 1}
         renderer = Grey() if renderer is None else renderer
         return MeshData(renderer, str(path), views=str(tmp_path / "rendered"), **{**settings, **changes})
 
@@ -362,20 +425,19 @@ def mesh_data(meshes, tmp_path):
 
 def test_meshes_are_rendered_on_first_use_only_and_then_not_even_loaded(mesh_data, monkeypatch, capfd):
     first = Grey()
-    mesh_data(first).prepare_data()
+    mesh_data(first).prepare()
     assert first.drawn == 2 * (216 + 2)
-    assert "rendering" in capfd.readouterr().err
 
     def fail(path: Path) -> None:
         raise AssertionError("loaded again")
 
-    monkeypatch.setattr(sources, "load_scene", fail)
+    monkeypatch.setattr(rendered, "load_scene", fail)
     second = Grey()
     data = mesh_data(second)
-    data.prepare_data()
+    data.prepare()
     assert second.drawn == 0 and capfd.readouterr() == ("", "")
-    assert data.table("test").names == ["brick", "cube"] and data.table("test").counts == [2, 2]
-    assert data.table("train").ambiguities == ["unlabelled"] * 2 and data.table("train").unique_answer == [None] * 2
+    assert data.names() == ["brick", "cube"] and [len(data.views(name, "test")) for name in data.names()] == [2, 2]
+    assert labels_of(data) == labels_of(data, "train") == dict.fromkeys(["brick", "cube"], ("unlabelled", None))
 
 
 def test_the_render_command_sees_another_mesh_under_the_name(mesh_data, meshes):
@@ -387,43 +449,43 @@ def test_the_render_command_sees_another_mesh_under_the_name(mesh_data, meshes):
 
 
 def test_another_protocol_is_seen_in_any_case(mesh_data):
-    mesh_data().prepare_data()
+    mesh_data().prepare()
     with pytest.raises(UserError, match=r"rendered differently \(test_views was 2, is 3\)"):
-        mesh_data(test_views=3).prepare_data()
+        mesh_data(test_views=3).prepare()
 
 
 def test_a_broken_mesh_is_named_and_the_others_are_rendered(mesh_data, meshes, tmp_path):
     (meshes / "broken.ply").write_text("not a mesh")
-    with pytest.raises(UserError, match=r"1 of 3 objects could not be rendered:\n  broken: .*broken\.ply") as caught:
-        mesh_data().prepare_data()
+    with pytest.raises(UserError, match=r"1 of 3 objects could not be rendered: broken: .*broken\.ply") as caught:
+        mesh_data().prepare()
     assert "brick" not in str(caught.value)
     assert sorted(path.name for path in (tmp_path / "rendered").iterdir() if path.is_dir()) == ["brick", "cube"]
     (meshes / "broken.ply").unlink()
     renderer = Grey()
-    mesh_data(renderer).prepare_data()
+    mesh_data(renderer).prepare()
     assert renderer.drawn == 0
 
 
 def test_what_else_lies_among_the_views_is_not_part_of_the_data_set(mesh_data, meshes, tmp_path):
     write_object(tmp_path / "rendered", "cup", train=12)
-    mesh_data().prepare_data()
+    mesh_data().prepare()
     (meshes / "brick.ply").unlink()
-    assert mesh_data().table("test").names == ["cube"]
+    assert mesh_data().names() == ["cube"]
     assert RenderingsData(str(tmp_path / "rendered")).names() == ["brick", "cube", "cup"]
 
 
-def labels_of(data: MeshData, split: str = "test") -> dict[str, tuple[str, bool | None]]:
-    table = data.table(split)
-    return dict(zip(table.names, zip(table.ambiguities, table.unique_answer, strict=True), strict=True))
+def labels_of(source: ViewSource, split: str = "test") -> dict[str, tuple[str, bool | None]]:
+    views = [source.views(name, split) for name in source.names()]
+    return {each.name: (each.ambiguity, each.unique_answer) for each in views}
 
 
 def test_labels_of_a_file_hold_for_views_that_are_there_already_and_change_nothing_on_disk(mesh_data, tmp_path):
-    mesh_data().prepare_data()
+    mesh_data().prepare()
     before = {path: path.read_bytes() for path in (tmp_path / "rendered").rglob("*.*") if path.is_file()}
     file = tmp_path / "labels.yaml"
     file.write_text("brick: {ambiguity: twofold, reason: two ends alike}\ncube: {ambiguity: unique}\n")
     data = mesh_data(Grey(), labels=str(file))
-    data.prepare_data()
+    data.prepare()
     assert labels_of(data) == labels_of(data, "train") == {"brick": ("twofold", True), "cube": ("unique", True)}
     file.write_text("brick: {ambiguity: continuous}\ncube: {ambiguity: continuous, unique_answer: true}\n")
     data = mesh_data(labels=str(file))
@@ -436,9 +498,9 @@ def test_labels_of_a_file_hold_for_views_that_are_there_already_and_change_nothi
 def test_labels_are_rendered_into_new_views(mesh_data, tmp_path):
     file = tmp_path / "labels.yaml"
     file.write_text("{brick: {ambiguity: twofold}, cube: {ambiguity: continuous}}")
-    mesh_data(labels=str(file)).prepare_data()
+    mesh_data(labels=str(file)).prepare()
     expected = {"brick": ("twofold", True), "cube": ("continuous", False)}
-    assert labels_of(mesh_data()) == labels_of(RenderingsData(str(tmp_path / "rendered"), str(tmp_path))) == expected
+    assert labels_of(mesh_data()) == labels_of(RenderingsData(str(tmp_path / "rendered"))) == expected
 
 
 def test_one_file_of_labels_serves_seen_and_unseen_objects(mesh_data, tmp_path):
@@ -459,7 +521,7 @@ def test_files_that_are_no_meshes_are_passed_over(mesh_data, meshes):
 def test_two_meshes_of_one_name(mesh_data, meshes):
     trimesh.creation.box().export(meshes / "cube.stl")
     with pytest.raises(UserError, match="several objects have the same name: cube"):
-        mesh_data().prepare_data()
+        mesh_data().prepare()
 
 
 def test_folders_without_meshes(mesh_data, tmp_path):
@@ -468,20 +530,21 @@ def test_folders_without_meshes(mesh_data, tmp_path):
     for name, message in (
         ("nowhere", r"nowhere: there is no such folder of meshes; give data\.path=FOLDER"),
         ("file.ply", r"file\.ply: there is no such folder of meshes"),
-        ("empty", r"empty: holds no mesh file \(known formats: .*\.glb"),
+        ("empty", r"empty: holds no meshes; looked for .*\.glb"),
     ):
         with pytest.raises(UserError, match=message):
-            mesh_data(path=tmp_path / name).prepare_data()
+            mesh_data(path=tmp_path / name).prepare()
     assert not (tmp_path / "rendered").exists()
 
 
 def test_the_embedded_objects_are_rendered_with_their_labels(tmp_path, monkeypatch):
-    quick = [replace(obj, load=partial(trimesh.Scene, trimesh.creation.box())) for obj in sources.toy_objects()]
-    monkeypatch.setattr(sources, "toy_objects", lambda: quick)
-    data = ToyData(Grey(), str(tmp_path / "toy"), 8, test_views=2, workers=1, cache=str(tmp_path), image_size=8)
+    quick = [replace(obj, load=partial(trimesh.Scene, trimesh.creation.box())) for obj in rendered.toy_objects()]
+    monkeypatch.setattr(rendered, "toy_objects", lambda: quick)
+    source = ToyData(Grey(), str(tmp_path / "toy"), 8, test_views=2, workers=1)
+    data = PairDataModule(source, cache=str(tmp_path), image_size=8)
     data.prepare_data()
     table = data.table("test")
-    labels = {obj.name: (obj.ambiguity, obj.unique_answer) for obj in data.objects()}
+    labels = {obj.name: (obj.ambiguity, obj.unique_answer) for obj in source.objects()}
     assert table.names == sorted(labels) and len(table.names) == 12
     assert dict(zip(table.names, zip(table.ambiguities, table.unique_answer, strict=True), strict=True)) == labels
     assert data.table("train").counts == [208] * 12 and data.table("validation").counts == [8] * 12
@@ -495,4 +558,4 @@ def test_the_data_sets_are_known_by_name():
 
 def test_a_folder_of_views_that_is_not_there(tmp_path):
     with pytest.raises(UserError, match=r"nowhere: there is no such folder of views"):
-        RenderingsData(str(tmp_path / "nowhere"), cache=str(tmp_path)).prepare_data()
+        PairDataModule(RenderingsData(str(tmp_path / "nowhere")), cache=str(tmp_path)).prepare_data()

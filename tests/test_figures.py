@@ -31,8 +31,10 @@ from lp_framework.analysis.generated import generated_views
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
 from lp_framework.analysis.pairs import named_pairs, truths
 from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
-from lp_framework.data.sources import MeshData, RenderingsData
+from lp_framework.data.sets.rendered import MeshData
+from lp_framework.data.source import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.figures.cameras import CamerasFigure
 from lp_framework.figures.failures import FailuresFigure
@@ -57,7 +59,7 @@ def data(tmp_path_factory):
     """Test views of three objects, ready for use."""
     folder = tmp_path_factory.mktemp("views")
     write_objects(folder / "views", test=4)
-    data = RenderingsData(str(folder / "views"), cache=str(folder / "cache"), image_size=16)
+    data = PairDataModule(RenderingsData(str(folder / "views")), cache=str(folder / "cache"), image_size=16)
     data.evaluate_on("ordered", 0)
     data.prepare_data()
     return data
@@ -227,10 +229,11 @@ def meshes(tmp_path_factory):
     box.visual.face_colors = np.random.default_rng(0).integers(0, 255, (12, 3)).repeat(1, axis=0)
     for name in ("box", "crate"):
         box.export(folder / "boxes" / f"{name}.ply")
-    data = MeshData(
+    source = MeshData(
         RaycastRenderer(), str(folder / "boxes"), str(folder / "views"), resolution=64, test_views=2, workers=1,
-        latitude_step_degrees=60, longitude_step_degrees=180, cache=str(folder / "cache"), image_size=64,
+        latitude_step_degrees=60, longitude_step_degrees=180,
     )  # fmt: skip
+    data = PairDataModule(source, cache=str(folder / "cache"), image_size=64)
     data.evaluate_on("ordered", 0)
     data.prepare_data()
     return data

@@ -369,10 +369,10 @@ def test_images_of_views(tmp_path_factory, content):
 def test_entries_of_a_cache(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("cache")
 
-    def fill(array: np.ndarray) -> None:
-        array[:] = np.arange(12).reshape(3, 4)
+    def blocks() -> list[np.ndarray]:
+        return [np.arange(12, dtype=np.float32).reshape(3, 4)]
 
-    cached_array(folder, "key", (3, 4), np.float32, fill)
+    cached_array(folder, "key", 3, blocks)
     file = data.draw(st.sampled_from([folder / "key.npy", folder / "key.json"]), "file")
     file.write_bytes(data.draw(damaged(file.read_bytes()), "content"))
-    assert np.array_equal(cached_array(folder, "key", (3, 4), np.float32, fill), np.arange(12).reshape(3, 4))
+    assert np.array_equal(cached_array(folder, "key", 3, blocks), np.arange(12).reshape(3, 4))

@@ -25,9 +25,8 @@ def root(tmp_path) -> Path:
 @pytest.fixture
 def make(root, tmp_path):
     def build(**changes) -> HOPEv2Data:
-        settings = {"train_views": 5, "test_views": 3, "resolution": 96, "image_size": 32, "validation_views": 0}
-        views, cache = str(tmp_path / "views"), str(tmp_path / "cache")
-        return HOPEv2Data(str(root), **{"views": views, "cache": cache, **settings, **changes})
+        settings = {"views": str(tmp_path / "views"), "train_views": 5, "test_views": 3, "resolution": 96}
+        return HOPEv2Data(str(root), **{**settings, **changes})
 
     return build
 
@@ -39,9 +38,9 @@ def test_crops_show_what_their_spherical_cameras_see(make, root, tmp_path):
     assert registry.get("data", "hopev2") is HOPEv2Data
     data = make()
     with pytest.warns(UserWarning, match="object 'obj_000001': 3 occluded are left out"):
-        data.prepare_data()
+        data.prepare()
     assert data.names() == ["obj_000001"]
-    assert data.table("train").counts == [5] and data.table("test").counts == [3]
+    assert [len(data.views("obj_000001", split)) for split in ("train", "test")] == [5, 3]
     known = torch.stack([camera for camera, _ in real_cameras(9)])
     sources = set()
     for split in ("train", "test"):
@@ -72,7 +71,7 @@ def test_crops_show_what_their_spherical_cameras_see(make, root, tmp_path):
 
 def test_relative_radii_follow_the_distances(make, tmp_path):
     with pytest.warns(UserWarning):
-        make().prepare_data()
+        make().prepare()
     frames = json.loads((tmp_path / "views" / "obj_000001" / "train" / "transform.json").read_text())["frames"]
     pairs = [(np.linalg.norm(np.array(f["photograph_camera"])[:3, 3]), f["latlon"][2]) for f in frames]
     inside = [distance / radius for distance, radius in pairs if 1.2 < radius < 2.0]
@@ -82,21 +81,21 @@ def test_relative_radii_follow_the_distances(make, tmp_path):
 def test_a_download_is_left_alone_and_converted_once(make, root, tmp_path):
     before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
     with pytest.warns(UserWarning):
-        make().prepare_data()
+        make().prepare()
     assert {file: file.read_bytes() for file in root.rglob("*") if file.is_file()} == before
     record = tmp_path / "views" / "obj_000001" / "conversion.json"
     stamp, content = record.stat().st_mtime_ns, json.loads(record.read_text())
     assert content["left_out"] == {"occluded": 3} and content["largest_turn_degrees"] > 10
-    make().prepare_data()
+    make().prepare()
     assert record.stat().st_mtime_ns == stamp
     with pytest.warns(UserWarning), pytest.raises(UserError, match="holds other views than these settings make"):
-        make(train_views=4).prepare_data()
+        make(train_views=4).prepare()
 
 
 def test_images_may_be_jpegs_of_an_onboarding_sequence(make, root):
     write_scene(root / "onboarding_static" / "obj_000001_up", real_cameras(8, seed=4), suffix=".jpg")
     with pytest.warns(UserWarning):
-        make(train_views=12).prepare_data()  # more than there are in `val`
+        make(train_views=12).prepare()  # more than there are in `val`
 
 
 def test_a_crop_that_shrinks_the_photograph_is_averaged_not_sampled(tmp_path):
@@ -182,7 +181,7 @@ def entry(key: str, value):
 def test_damaged_data(make, root, tmp_path, damage, message):
     damage(root)
     with pytest.raises(UserError, match=message) as caught:
-        make(train_views=6).prepare_data()
+        make(train_views=6).prepare()
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "views").glob("*obj_*"))
 
@@ -205,28 +204,28 @@ def test_objects_that_cannot_be_converted_are_listed_and_the_others_are_ready(ma
     )
     for _ in range(2):
         with pytest.raises(UserError, match=lines):
-            make(train_views=6).prepare_data()
+            make(train_views=6).prepare()
         assert [file.name for file in (tmp_path / "views").glob("*obj_*")] == ["obj_000001"]
     rewrite(tmp_path / "views" / "objects.json", lambda lists: lists.update(seen=["obj_000001"]))
     data = make(train_views=6)
-    data.prepare_data()
-    assert data.table("train").names == ["obj_000001"]
+    data.prepare()
+    assert data.names() == ["obj_000001"]
 
 
 def test_what_is_wrong_for_all_objects_is_said_once(make, root):
     write_models(root, 1, 2)
     scene(root, "scene_gt.json").write_text("{")
     with pytest.raises(UserError, match=r"2 of 2 objects .*json: obj_000001, obj_000002: .*is not readable JSON"):
-        make().prepare_data()
+        make().prepare()
 
 
 def test_an_object_with_fewer_views_than_asked(make):
     with pytest.raises(
         UserError, match=r"'obj_000001' has 9 usable views \(3 occluded are left out\).*train_views=100 .* ask for 103"
     ):
-        make(train_views=100).prepare_data()
+        make(train_views=100).prepare()
     with pytest.raises(UserError, match=r"data\.test_views must be at least 2, got 1"):
-        make(test_views=1).prepare_data()
+        make(test_views=1).prepare()
 
 
 def test_wrong_roots(make, root, tmp_path):
@@ -238,7 +237,7 @@ def test_wrong_roots(make, root, tmp_path):
         with pytest.raises(UserError, match=message):
             HOPEv2Data(str(tmp_path / path), views=str(tmp_path / "views")).names()
     with pytest.raises(UserError, match=r"no annotated scenes; looked for .*hope/train/\*/scene_gt\.json"):
-        make(splits=["train"]).prepare_data()
+        make(splits=["train"]).prepare()
 
 
 def test_views_too_near_or_too_distorted_are_left_out_and_counted():

@@ -10,6 +10,7 @@ from PIL import Image
 from view_folders import write_object
 
 from lp_framework import registry
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.sets.omni3d import Omni3DData, omni3d_cameras, omni3d_objects
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
@@ -46,8 +47,9 @@ def root(tmp_path) -> Path:
 
 
 @pytest.fixture
-def data(root, tmp_path) -> Omni3DData:
-    return Omni3DData(str(root), str(tmp_path / "views"), cache=str(tmp_path / "cache"), image_size=16)
+def data(root, tmp_path) -> PairDataModule:
+    source = Omni3DData(str(root), str(tmp_path / "views"))
+    return PairDataModule(source, cache=str(tmp_path / "cache"), image_size=16)
 
 
 # ---------------------------------------------------------------- conversion
@@ -143,7 +145,7 @@ def alone(root: Path) -> None:
         (cut_short, r"poses/001\.npy: is not a readable array"),
         (of_another_shape, r"poses/001\.npy: must be a 4 x 4 camera-to-world matrix .* got \[3, 3\]"),
         (of_complex_numbers, r"poses/001\.npy: is not a readable array"),
-        (scaled, r"poses/001\.npy: is not a rigid camera-to-world transform"),
+        (scaled, r"poses/001\.npy: its camera is not a rigid camera-to-world transform"),
         (y_up, r"poses/001\.npy: its camera does not look at the origin with \+Z up"),
         (at_the_centre, r"poses/001\.npy: its camera must stand off the origin"),
         (alone, r"dinosaur_002/poses: two or more poses \(\*\.npy\) are needed, 1 are there"),
@@ -287,7 +289,8 @@ def test_the_published_results_with_zero123_xl(published, capsys):
 
 
 def test_the_published_views_load(published, tmp_path):
-    data = Omni3DData(str(published), str(tmp_path / "views"), cache=str(tmp_path / "cache"), image_size=32)
+    source = Omni3DData(str(published), str(tmp_path / "views"))
+    data = PairDataModule(source, cache=str(tmp_path / "cache"), image_size=32)
     data.evaluate_on("ordered", 0)
     data.prepare_data()
     table = data.table("test")

@@ -17,6 +17,7 @@ from tiny_runs import OBJECTS, ROOT, Commands, Ran
 from lp_framework import registry
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch
+from lp_framework.data.source import RenderingsData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.models.pose_model import ScoreModel
 
@@ -135,7 +136,7 @@ def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(
     optimizer = model.configure_optimizers()
     loaders, here = [], SimpleNamespace(root_device=torch.device("cpu"))
     for rank in (0, 1):
-        data = PairDataModule(str(commands.folder / "views"), str(tmp_path / "cache"), 16, 40, 3, 2, 0)
+        data = PairDataModule(RenderingsData(str(commands.folder / "views")), str(tmp_path / "cache"), 16, 40, 3, 2)
         data.trainer = SimpleNamespace(global_rank=rank, world_size=2, strategy=here)
         data.cache_features(model.extractor())
         loaders.append(data.train_dataloader())

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lp_framework.data.real_cameras import (
-    FIELD_OF_VIEW_DEGREES,
     crop_field_of_view,
     crop_homography,
     effective_radii,
@@ -20,6 +19,7 @@ from lp_framework.data.real_cameras import (
     turn_towards_centre,
     z_up_to_y_up,
 )
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.geometry import (
     camera_to_world,
     inverse,

@@ -20,7 +20,7 @@ from lp_framework.data.rendering import auto, pyrender_renderer
 from lp_framework.data.rendering.auto import AutoRenderer
 from lp_framework.data.rendering.pyrender_renderer import PyrenderRenderer, offscreen_context
 from lp_framework.data.rendering.raycast import RaycastRenderer
-from lp_framework.data.rendering.renderer import Renderer, downsample
+from lp_framework.data.rendering.renderer import Renderer, View, downsample
 from lp_framework.data.rendering.views import ViewProtocol, render_object, render_objects
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, to_ifusion, view_pose
@@ -218,7 +218,34 @@ def test_textures_are_upright_and_repeat(renderer):
 def test_downsampling_takes_the_mean_with_premultiplied_alpha():
     samples = np.zeros((2, 4, 4), np.uint8)
     samples[0, 0], samples[1, 1] = (200, 100, 0, 255), (100, 100, 40, 255)
-    np.testing.assert_array_equal(downsample(samples), [[[150, 100, 20, 128], [0, 0, 0, 0]]])
+    depth = np.zeros((2, 4), np.float32)
+    depth[0, 0], depth[1, 1] = 1.5, 1.25
+    view = downsample(samples, depth)
+    np.testing.assert_array_equal(view.pixels, [[[150, 100, 20, 128], [0, 0, 0, 0]]])
+    np.testing.assert_array_equal(view.depth, [[1.25, 0]])  # of the nearest sample
+    assert view.depth.dtype == np.float32
+
+
+@pytest.mark.parametrize("pose", [(0, 0, 1.5), (0, 90, 2.0), (25, 40, 1.3)])
+def test_depth_is_along_the_optical_axis_and_zero_where_there_is_nothing(renderer, pose):
+    centre, radius, resolution = np.array([0.1, -0.2, 0.3]), 0.25, 64
+    scene = trimesh.Scene([trimesh.creation.icosphere(subdivisions=5, radius=radius)])
+    scene.geometry[next(iter(scene.geometry))].apply_translation(centre)
+    (matrix,) = cameras(pose).numpy()
+    (view,) = renderer.views(scene, matrix[None], resolution, FIELD_OF_VIEW)
+    assert view.depth.shape == (resolution, resolution) and view.depth.dtype == np.float32
+    np.testing.assert_array_equal(view.depth > 0, view.pixels[..., 3] > 0)
+    # Where rays through the pixels' centres meet the ball, spelt out.
+    row, column = np.mgrid[0:resolution, 0:resolution] + 0.5
+    step = 2 * math.tan(math.radians(FIELD_OF_VIEW) / 2) / resolution
+    rays = np.stack([(column - resolution / 2) * step, (resolution / 2 - row) * step, -np.ones_like(row)], axis=-1)
+    place = matrix[:3, :3].T @ (centre - matrix[:3, 3])
+    along, square = rays @ place, (rays**2).sum(axis=-1)
+    inside = along**2 - square * (place @ place - radius**2)
+    inner = inside > 0.2 * inside.max()  # not the rim, where depth changes within a pixel
+    expected = (along - np.sqrt(np.maximum(inside, 0))) / square  # the ray's third component is -1
+    np.testing.assert_allclose(view.depth[inner], expected[inner], atol=0.02)
+    assert abs((view.depth - expected)[inner].mean()) < 0.01
 
 
 # ---------------------------------------------------------------- agreement of the renderers
@@ -325,7 +352,7 @@ def test_steps_that_do_not_divide_the_range_stay_inside_it():
     [
         {"resolution": 0}, {"field_of_view_degrees": 180}, {"lowest_latitude_degrees": 31}, {"test_views": -1},
         {"highest_latitude_degrees": 91}, {"latitude_step_degrees": 0}, {"longitude_step_degrees": -15},
-        {"nearest_radius": 0}, {"farthest_radius": 1.0},
+        {"nearest_radius": 0}, {"farthest_radius": 1.0}, {"train_views": 0},
     ],
 )  # fmt: skip
 def test_impossible_protocols_are_user_errors(wrong):
@@ -343,15 +370,15 @@ class FlatRenderer(Renderer):
 
     name = "flat"
 
-    def __init__(self, fails_at: int | None = None) -> None:
-        self.fails_at, self.drawn = fails_at, 0
+    def __init__(self, fails_at: int | None = None, error: type[BaseException] = RuntimeError) -> None:
+        self.fails_at, self.error, self.drawn = fails_at, error, 0
 
     def views(self, scene, camera_to_world, resolution, field_of_view_degrees):
         for _ in camera_to_world:
             if self.drawn == self.fails_at:
-                raise RuntimeError("killed")
+                raise self.error("killed")
             self.drawn += 1
-            yield np.full((resolution, resolution, 4), self.drawn, np.uint8)
+            yield View(np.full((resolution, resolution, 4), self.drawn, np.uint8))
 
 
 def objects_named(*names: str) -> list[MeshObject]:
@@ -364,9 +391,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_written_views_have_ifusions_layout(tmp_path):
     protocol = ViewProtocol(resolution=32, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)
-    ready = []
-    assert render_object(*objects_named("cube"), tmp_path, protocol, RaycastRenderer(), ready.append)
-    assert sum(ready) == protocol.views_per_object() == 11
+    assert render_object(*objects_named("cube"), tmp_path, protocol, RaycastRenderer())
     for split, poses in (("train", protocol.training_poses("cube")), ("test", protocol.test_poses("cube"))):
         folder = tmp_path / "cube" / split
         transform = json.loads((folder / "transform.json").read_text())
@@ -456,11 +481,8 @@ def test_a_failed_run_gives_its_lock_back_while_its_error_is_still_looked_at(tmp
 
 
 def test_an_interrupt_by_the_user_leaves_no_half_object(tmp_path):
-    def interrupt(_views: int) -> None:
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer(), interrupt)
+        render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer(fails_at=3, error=KeyboardInterrupt))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -493,6 +515,49 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     assert contents(tmp_path) == {"cube/thesis.txt": b"precious"}
 
 
+def test_few_views_an_object_are_random_in_the_ranges(tmp_path):
+    few = replace(SMALL, train_views=5)
+    poses = few.training_poses("cube")
+    assert poses.shape == (5, 3) and not np.array_equal(poses[:2], few.test_poses("cube"))
+    assert (np.abs(np.degrees(poses[:, 0])) <= 30).all() and len(set(poses[:, 0])) == 5
+    assert ((poses[:, 2] >= 1.2) & (poses[:, 2] <= 2.0)).all()
+    np.testing.assert_array_equal(poses, replace(few, resolution=99).training_poses("cube"))
+    render_objects(objects_named("cube"), tmp_path, few, FlatRenderer(), workers=1)
+    assert len(list((tmp_path / "cube" / "train" / "rgb").iterdir())) == 5
+    for check_meshes in (False, True):
+        render_objects(objects_named("cube"), tmp_path, few, FlatRenderer(fails_at=0), 1, check_meshes)
+        with pytest.raises(UserError, match=r"rendered differently \(train_views was 5, is None\)"):
+            render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), 1, check_meshes)
+
+
+def test_records_are_as_they_were_before_later_settings_came(tmp_path):
+    render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
+    record = json.loads((tmp_path / "cube" / "render.json").read_text())
+    assert set(record["protocol"]) == {
+        "resolution", "field_of_view_degrees", "lowest_latitude_degrees", "highest_latitude_degrees",
+        "latitude_step_degrees", "longitude_step_degrees", "nearest_radius", "farthest_radius", "test_views", "seed",
+    }  # fmt: skip
+
+
+def test_depths_are_kept_where_they_are_asked_for(tmp_path):
+    protocol = replace(SMALL, depth=True)
+    with pytest.raises(UserError, match=r"renderer=flat knows no depth; set data\.depth=false"):
+        render_objects(objects_named("cube"), tmp_path / "flat", protocol, FlatRenderer(), workers=1)
+    (cube,) = objects_named("cube")
+    render_objects([cube], tmp_path, protocol, RaycastRenderer(), workers=1)
+    cameras_of_tests = camera_to_world(torch.from_numpy(protocol.test_poses("cube")))
+    for index, view in enumerate(RaycastRenderer().views(cube.load(), cameras_of_tests, 16, 49.1)):
+        levels = np.asarray(Image.open(tmp_path / "cube" / "test" / "depth" / f"{index:03d}.png"))
+        assert levels.dtype == np.uint16
+        np.testing.assert_allclose(levels * 1e-4, view.depth, atol=0.6e-4)
+    for check_meshes in (False, True):  # they do no harm where they are not wanted, but are missed where they are
+        render_objects([cube], tmp_path, SMALL, FlatRenderer(fails_at=0), 1, check_meshes)
+        render_objects([cube], tmp_path, protocol, FlatRenderer(fails_at=0), 1, check_meshes)
+    render_objects([cube], tmp_path / "without", SMALL, FlatRenderer(), workers=1)
+    with pytest.raises(UserError, match=r"rendered differently \(depth was False, is True\)"):
+        render_objects([cube], tmp_path / "without", protocol, RaycastRenderer(), 1, check_meshes=False)
+
+
 def test_a_full_disk_is_a_user_error_and_keeps_what_is_finished(tmp_path, monkeypatch):
     save, room = Image.Image.save, [11 + 4]
 
@@ -503,7 +568,7 @@ def test_a_full_disk_is_a_user_error_and_keeps_what_is_finished(tmp_path, monkey
         save(image, path, **options)
 
     monkeypatch.setattr(Image.Image, "save", save_while_there_is_room)
-    with pytest.raises(UserError, match=r"1 of 2 objects.*\n.*second.*the disk is full"):
+    with pytest.raises(UserError, match=r"1 of 2 objects could not be rendered: second: .*the disk is full"):
         render_objects(objects_named("first", "second"), tmp_path, SMALL, FlatRenderer(), workers=1)
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["first"]
     assert len(contents(tmp_path / "first")) == 11 + 2 + 1

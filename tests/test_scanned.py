@@ -43,7 +43,7 @@ OO3D = ["apple_001", "apple_002", "toy_car_001", "toy_car_002", "teddy_001"]
 
 def gso(root: Path, **settings) -> GSOData:
     settings = {"views": str(root.parent / "views"), "seen": 5, "unseen": 2, **settings}
-    return GSOData(None, str(root), cache=str(root.parent / "cache"), **settings)
+    return GSOData(None, str(root), **settings)
 
 
 def test_a_seeded_choice_is_kept_beside_the_views(tmp_path):
@@ -79,13 +79,13 @@ def test_categories_with_an_underscore(tmp_path):
 
 def test_bad_downloads(tmp_path):
     root = write_gso(tmp_path / "gso", *GSO)
-    with pytest.raises(UserError, match="nowhere: there is no such folder"):
+    with pytest.raises(UserError, match="nowhere: there is no such folder of objects of GSO"):
         gso(tmp_path / "nowhere").names()
-    with pytest.raises(UserError, match=r"holds no object of GSO; looked for .*OBJECT/meshes/model\.obj"):
+    with pytest.raises(UserError, match=r"holds no objects of GSO; looked for .*\*/meshes/model\.obj"):
         gso(root / "Object_0").names()
     with pytest.raises(UserError, match="9 objects are there, 80 are needed"):
         gso(root, seen=70, unseen=10).names()
-    with pytest.raises(UserError, match=r"looked for .*CATEGORY/CATEGORY_001/Scan/Scan\.obj"):
+    with pytest.raises(UserError, match=r"looked for .*\*/\*/Scan/Scan\.obj"):
         OO3DData(None, str(root), views=str(tmp_path / "views")).names()
     with pytest.raises(UserError, match="nowhere: there is no such folder"):
         OO3DData(None, str(tmp_path / "nowhere"), views=str(tmp_path / "views")).names()
@@ -106,13 +106,10 @@ def test_rendering_objects_as_released(tmp_path):
 
     root = write_gso(tmp_path / "gso", *GSO[:2])
     settings = {"resolution": 24, "test_views": 2, "latitude_step_degrees": 60.0, "longitude_step_degrees": 180.0}
-    data = GSOData(
-        RaycastRenderer(), str(root), str(tmp_path / "views"), seen=1, unseen=1, workers=1, image_size=16,
-        cache=str(tmp_path / "cache"), validation_views=0, **settings,
-    )  # fmt: skip
-    data.prepare_data()
+    data = GSOData(RaycastRenderer(), str(root), str(tmp_path / "views"), seen=1, unseen=1, workers=1, **settings)
+    data.prepare()
     (name,) = data.names()
-    assert data.table("train").counts == [4] and data.table("test").counts == [2]
+    assert [len(data.views(name, split)) for split in ("train", "test")] == [4, 2]
     pixels = np.asarray(Image.open(tmp_path / "views" / name / "train" / "rgb" / "000.png")).astype(int)
     rows = [pixels[half][pixels[half][..., 3] > 200] for half in (slice(0, 12), slice(12, 24))]
     assert (rows[0][:, 0] > rows[0][:, 2]).mean() > 0.5 > (rows[1][:, 0] > rows[1][:, 2]).mean()  # red on top

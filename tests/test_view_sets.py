@@ -15,6 +15,7 @@ from view_folders import write_objects
 
 from lp_framework.analysis.examples import read_examples
 from lp_framework.data.module import PairDataModule
+from lp_framework.data.source import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution
@@ -34,7 +35,7 @@ def commands(tmp_path_factory) -> Commands:
 @pytest.fixture
 def data(tmp_path) -> PairDataModule:
     write_objects(tmp_path / "views", {"cup": "unique", "vase": "continuous"}, train=3, test=TEST_VIEWS)
-    return PairDataModule(str(tmp_path / "views"), str(tmp_path / "cache"), 16, 40, 3, 0, 0)
+    return PairDataModule(RenderingsData(str(tmp_path / "views")), str(tmp_path / "cache"), 16, 40, 3, 0)
 
 
 class Remembering(Solver):

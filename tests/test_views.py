@@ -10,7 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from view_folders import FIELD_OF_VIEW, random_poses, transforms, write_object, write_objects, write_split
 
-from lp_framework.data.views import LARGEST_RESIDUAL, object_names, read_views
+from lp_framework.data.reading import LARGEST_RESIDUAL
+from lp_framework.data.views import object_names, read_views
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, rigid_transform, so3_exp
 
@@ -136,7 +137,7 @@ def test_objects_are_folders_with_a_split_in_them(tmp_path):
 def test_a_root_without_views(tmp_path):
     with pytest.raises(UserError, match=r"nowhere: there is no such folder of views.*data\.path"):
         object_names(tmp_path / "nowhere")
-    with pytest.raises(UserError, match=r"holds no views; expected .*OBJECT/train/transform\.json"):
+    with pytest.raises(UserError, match=r"holds no views; looked for .*OBJECT/train/transform\.json"):
         object_names(tmp_path)
 
 
@@ -251,7 +252,7 @@ MIRRORED = GOOD @ torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.flo
 )  # fmt: skip
 def test_what_is_not_rigid(path, matrix):
     rewrite_frame(path, 1, transform_matrix=matrix)
-    assert "transform_matrix of frame 1 is not a rigid camera-to-world transform" in sentence(path)
+    assert "the camera of frame 1 is not a rigid camera-to-world transform" in sentence(path)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import subprocess
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -26,6 +27,8 @@ from torch import nn
 
 from lp_framework import registry
 from lp_framework.api import TINY_KNOWS
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.source import ViewSource
 from lp_framework.errors import UserError, one_line
 from lp_framework.models.checkpoints import describe, find_checkpoint, load_model
 
@@ -95,7 +98,8 @@ class Components:
         return registry.component_names(registry.get(group, self.settings[group]["name"]))
 
     def _build(self, group: str) -> Any:
-        return registry.build(group, self.settings[group], **{each: self[each] for each in self.needs(group)})
+        build = build_data if group == "data" else partial(registry.build, group)
+        return build(self.settings[group], **{each: self[each] for each in self.needs(group)})
 
     def _is_trained(self, group: str) -> bool:
         return group == "model" and group not in self.settings
@@ -105,6 +109,15 @@ class Components:
             self.checkpoint = find_checkpoint(self.settings["checkpoint"])
         _say(f"model: {describe(self.checkpoint)}")
         return load_model(self.checkpoint)
+
+
+def build_data(settings: Mapping[str, Any], **components: object) -> PairDataModule:
+    """The data module of the source that `settings` name; they are those of both."""
+    loader, _ = registry.parameters(PairDataModule)
+    own = {key: value for key, value in settings.items() if key not in loader}
+    shared = {key: value for key, value in settings.items() if key in loader}
+    source: ViewSource = registry.build("data", own, **components)
+    return PairDataModule(source, **registry.checked(PairDataModule.__init__, shared, "data."))
 
 
 @rank_zero_only

@@ -32,12 +32,12 @@ from lp_framework.commands.building import (
 from lp_framework.commands.device import choose_device
 from lp_framework.data.camera_files import colmap_model, nerf_transforms
 from lp_framework.data.photographs import (
-    FIELD_OF_VIEW_DEGREES,
     SIZE,
     photograph_files,
     prepared_photographs,
     save_png,
 )
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.geometry import apply_relative_pose

@@ -1,7 +1,5 @@
-"""Views of objects and pairs of them; importing the package registers the data sets and the renderers."""
+"""Where views come from, views on disk, and batches of pairs; importing the package registers sources and renderers."""
 
-from lp_framework.data import sources
-from lp_framework.data.rendering import auto, pyrender_renderer, raycast
-from lp_framework.data.sets import co3d, hopev2, omni3d, scanned
+from lp_framework.data import rendering, sets, source
 
-__all__ = ["auto", "co3d", "hopev2", "omni3d", "pyrender_renderer", "raycast", "scanned", "sources"]
+__all__ = ["rendering", "sets", "source"]

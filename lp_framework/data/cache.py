@@ -10,46 +10,57 @@ import hashlib
 import json
 import os
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from filelock import FileLock
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
+from lp_framework.data.photographs import opened
+from lp_framework.data.views import DEPTH_UNIT
 from lp_framework.errors import UserError
 
 T = TypeVar("T")
 _CHUNK = 1 << 24  # bytes a checksum step
 
 
-def cached_array(
-    folder: str | Path, key: str, shape: Sequence[int], dtype: DTypeLike, fill: Callable[[NDArray], None]
-) -> NDArray:
-    """The array of a key, read-only and memory-mapped; `fill` computes it in place where it is missing or damaged."""
+def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], Iterable[NDArray]]) -> NDArray:
+    """The array `[count, ...]` of a key, read-only and memory-mapped.
+
+    Where it is missing or damaged, it is put together from `blocks`, which are `[n, ...]` of any one shape and type.
+    """
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / f"{key}.lock"):
-            if not _intact(folder, key, shape, dtype):
-                _write(folder, key, shape, dtype, fill)
+            if not _intact(folder, key, count):
+                _write(folder, key, count, blocks())
     except OSError as error:
         raise UserError(f"{folder}: the cache cannot be written ({error.strerror}); set data.cache=FOLDER") from error
     return np.load(folder / f"{key}.npy", mmap_mode="r")
 
 
-def _write(folder: Path, key: str, shape: Sequence[int], dtype: DTypeLike, fill: Callable[[NDArray], None]) -> None:
+def _write(folder: Path, key: str, count: int, blocks: Iterable[NDArray]) -> None:
     partial, note = folder / f"{key}.partial.npy", folder / f"{key}.partial.json"
+    array, place = None, 0
     try:
-        array = np.lib.format.open_memmap(partial, mode="w+", dtype=dtype, shape=tuple(shape))
-        _reserve(partial)
-        fill(array)
+        for block in blocks:
+            if array is None:
+                array = np.lib.format.open_memmap(
+                    partial, mode="w+", dtype=block.dtype, shape=(count, *block.shape[1:])
+                )
+                _reserve(partial)
+            array[place : place + len(block)] = block
+            place += len(block)
+        if array is None or place != count:
+            raise ValueError(f"the blocks of {key} have {place} rows, {count} are wanted")
         array.flush()
-        note.write_text(json.dumps({"shape": list(shape), "dtype": np.dtype(dtype).str, "checksum": _checksum(array)}))
+        note.write_text(json.dumps({"shape": array.shape, "dtype": array.dtype.str, "checksum": _checksum(array)}))
         del array
         (folder / f"{key}.json").unlink(missing_ok=True)
         os.replace(partial, folder / f"{key}.npy")
@@ -66,11 +77,11 @@ def _reserve(file: Path) -> None:
             os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
 
 
-def _intact(folder: Path, key: str, shape: Sequence[int], dtype: DTypeLike) -> bool:
+def _intact(folder: Path, key: str, count: int) -> bool:
     try:
         record = json.loads((folder / f"{key}.json").read_text())
         array = np.load(folder / f"{key}.npy", mmap_mode="r")
-        expected = list(shape) == record["shape"] == list(array.shape) and np.dtype(dtype) == array.dtype
+        expected = record["shape"] == list(array.shape) and record["dtype"] == array.dtype.str and len(array) == count
         return bool(expected) and _checksum(array) == record["checksum"]
     except Exception:  # damaged files raise anything from EOFError to SyntaxError
         return False
@@ -84,10 +95,10 @@ def _checksum(array: NDArray) -> int:
     return checksum
 
 
-def tracked(items: Sequence[T], description: str) -> Iterable[T]:
+def tracked(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
     """The items, with a progress bar on the terminal while they last; nothing is printed elsewhere."""
     console = Console(stderr=True)
-    return track(items, description, console=console, transient=True, disable=not console.is_terminal)
+    return track(items, description, total, console=console, transient=True, disable=not console.is_terminal)
 
 
 def content_key(files: Iterable[Path], *facts: object) -> str:
@@ -109,30 +120,54 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path) -> tuple
     """
     key = content_key(files, "views", size)
 
-    def fill(array: NDArray) -> None:
-        sizes: dict[Path, tuple[int, int]] = {}
-        for index, file in enumerate(tracked(files, "decoding views")):
-            image = _decode(file)
+    def decode(image: Image.Image) -> NDArray:
+        white = Image.new("RGBA", image.size, "white")
+        white.alpha_composite(image.convert("RGBA"))
+        return np.asarray(white.convert("RGB").resize((size, size), Image.Resampling.BOX, reducing_gap=None))
+
+    return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))
+
+
+def decoded_alpha(files: Sequence[Path], size: int, folder: str | Path, views: str) -> NDArray:
+    """The opacity `[N, size, size]` (uint8) of image files, resized as `decoded_views` does, whose key is `views`."""
+
+    def decode(image: Image.Image) -> NDArray:
+        return np.asarray(image.convert("RGBA").getchannel("A").resize((size, size), Image.Resampling.BOX))
+
+    key = content_key([], "alpha", views)
+    return cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding alpha"))
+
+
+def decoded_depths(files: Sequence[Path], size: int, folder: str | Path) -> NDArray:
+    """The depths `[N, size, size]` (float32) that belong to image files (see `views`): along the optical axis, in scene
+    units, 0 where there is nothing; of the sample nearest to each pixel. `UserError` where a view has none."""
+    depths = [file.parents[1] / "depth" / file.name for file in files]
+    if missing := [file for file in depths if not file.is_file()]:
+        raise UserError(
+            f"{missing[0]}: there is no such file; views that are rendered with data.depth=true have depths"
+        )
+
+    def decode(image: Image.Image) -> NDArray:
+        levels = np.asarray(image.resize((size, size), Image.Resampling.NEAREST))
+        return levels.astype(np.float32) * np.float32(DEPTH_UNIT)
+
+    key = content_key(depths, "depths", size)
+    return cached_array(folder, key, len(depths), lambda: _decoded(depths, decode, "decoding depths"))
+
+
+def _decoded(files: Sequence[Path], decode: Callable[[Image.Image], NDArray], description: str) -> Iterator[NDArray]:
+    """What `decode` makes of every image file, `[1, ...]` each; `UserError` naming one that is not as it should be."""
+    sizes: dict[Path, tuple[int, int]] = {}
+    for file in tracked(files, description):
+        with opened(file) as image:
+            width, height = image.size
+            if width != height:
+                raise UserError(f"{file}: is {width} x {height} pixels; views must be square")
             expected = sizes.setdefault(file.parent, image.size)
             if image.size != expected:
                 raise UserError(
-                    f"{file}: is {image.width} x {image.height} pixels, the other images of its folder are "
+                    f"{file}: is {width} x {height} pixels, the other images of its folder are "
                     f"{expected[0]} x {expected[1]}"
                 )
-            array[index] = np.asarray(image.resize((size, size), Image.Resampling.BOX, reducing_gap=None))
-
-    return key, cached_array(folder, key, (len(files), size, size, 3), np.uint8, fill)
-
-
-def _decode(file: Path) -> Image.Image:
-    """An image file over white, as RGB; square or a `UserError`."""
-    try:
-        with Image.open(file) as image:
-            rgba = image.convert("RGBA")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UserError(f"{file}: is not a readable image ({error})") from error
-    if rgba.width != rgba.height:
-        raise UserError(f"{file}: is {rgba.width} x {rgba.height} pixels; views must be square")
-    white = Image.new("RGBA", rgba.size, "white")
-    white.alpha_composite(rgba)
-    return white.convert("RGB")
+            block = decode(image)[None]
+        yield block

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -78,12 +79,8 @@ def load_scene(path: str | Path) -> trimesh.Scene:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
-    try:
+    with loading(path):
         scene = normalise(trimesh.load_scene(str(path)))
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    except Exception as error:  # the parsers of trimesh raise anything from KeyError to struct.error
-        raise UserError(f"{path}: does not load as a mesh ({type(error).__name__}: {error})") from error
     plain = sum(not _has_colour(mesh) for mesh in scene.geometry.values())
     if plain:
         warnings.warn(
@@ -91,6 +88,17 @@ def load_scene(path: str | Path) -> trimesh.Scene:
             stacklevel=2,
         )
     return scene
+
+
+@contextmanager
+def loading(path: Path, what: str = "a mesh") -> Iterator[None]:
+    """Make a `UserError` that names the file of whatever trimesh raises while it reads one."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except Exception as error:  # its parsers raise anything from KeyError to struct.error
+        raise UserError(f"{path}: does not load as {what} ({type(error).__name__}: {error})") from error
 
 
 def normalise(scene: trimesh.Scene) -> trimesh.Scene:

@@ -1,11 +1,11 @@
-"""The data module: views of objects on disk, rendered first where need be, as batches of pairs."""
+"""The data module: the views of a source, made first where need be, as batches of pairs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from lp_framework.data.cache import cached_array, content_key, decoded_views, tracked
+from lp_framework.data.cache import (
+    cached_array,
+    content_key,
+    decoded_alpha,
+    decoded_depths,
+    decoded_views,
+    tracked,
+)
 from lp_framework.data.pairs import (
     BlockSampler,
     ListSampler,
@@ -25,8 +32,10 @@ from lp_framework.data.pairs import (
     as_images,
     in_batches,
 )
-from lp_framework.data.views import ObjectViews, object_names, read_views
+from lp_framework.data.source import ViewSource
+from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
+from lp_framework.keyed_random import stable_id
 
 EVALUATION_PAIRS = 224  # pairs a batch, by default; four objects of eight test views
 LARGEST_SET = 8  # images that are evaluated together at most, as in the paper's multi-view table
@@ -35,10 +44,8 @@ LARGEST_SET = 8  # images that are evaluated together at most, as in the paper's
 class FeatureExtractor(Protocol):
     """What the data module asks of a backbone in order to cache its features."""
 
-    trunk_dim: int
-
     def trunk(self, images: Tensor) -> Tensor:
-        """Features `[I, trunk_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
+        """Features `[I, ...]` of images `[I, 3, H, W]` in [-1, 1]."""
 
     def to(self, device: torch.device) -> object:
         """Move it there."""
@@ -48,28 +55,42 @@ class FeatureExtractor(Protocol):
 
 
 class PairDataModule(LightningDataModule):
-    """Ordered pairs among each object's views, from a folder of views.
+    """Ordered pairs among the views of each object of a source.
 
-    `path` holds the views, `cache` the decoded ones (square, `image_size` pixels a side). A training batch has about
-    `batch_pairs` pairs over blocks of `block` views (see `BlockSampler`). `validation_views` of each object's training
-    views are held out to choose the best checkpoint; the test views are not touched before evaluation.
+    `cache` holds the decoded views (square, `image_size` pixels a side). A training batch has about `batch_pairs` pairs
+    over blocks of `block` views (see `BlockSampler`). `validation_views` of each object's training views are held out
+    to choose the best checkpoint; or, with `validation_objects`, so many objects, of which so many views are used then.
+    The test views are not touched before evaluation.
     """
 
     def __init__(
-        self, path: str, cache: str, image_size: int, batch_pairs: int, block: int, validation_views: int, seed: int
+        self,
+        source: ViewSource,
+        cache: str = "datasets/cache",
+        image_size: int = 256,
+        batch_pairs: int = 1024,
+        block: int = 8,
+        validation_views: int = 8,
+        validation_objects: int = 0,
+        seed: int = 0,
     ) -> None:
         super().__init__()
-        for name, value, least in (("image_size", image_size, 8), ("batch_pairs", batch_pairs, 1), ("block", block, 1)):
+        for name, value, least in (
+            ("image_size", image_size, 8), ("batch_pairs", batch_pairs, 1), ("block", block, 1),
+            ("validation_objects", validation_objects, 0),
+        ):  # fmt: skip
             if value < least:
                 raise UserError(f"data.{name} must be at least {least}, got {value}")
-        if validation_views == 1 or validation_views < 0:
+        if validation_views == 1 or validation_views < 0 or (validation_objects and not validation_views):
             raise UserError(
-                f"data.validation_views must be 0 or at least 2, a pair needs two views; got {validation_views}"
+                "data.validation_views must be at least 2, a pair needs two views, or 0 for no validation; got "
+                f"{validation_views} with data.validation_objects={validation_objects}"
             )
-        self.path, self.cache = Path(path), Path(cache)
+        self.source, self.cache = source, Path(cache)
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
-        self.validation_views, self.seed = validation_views, seed
+        self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
         self._extractor: FeatureExtractor | None = None
+        self._carried: set[str] = set()
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images a set, where sets are evaluated
         self._evaluation_pairs = EVALUATION_PAIRS
@@ -81,7 +102,8 @@ class PairDataModule(LightningDataModule):
     # ------------------------------------------------------------ what there is
 
     def prepare_data(self) -> None:
-        """Make what is missing on disk, in one process: decoded views, cached features."""
+        """Make what is missing on disk, in one process: views, decoded views, cached features."""
+        self.source.prepare()
         self.data("train" if self._evaluation is None else self.evaluation_split())
 
     def table(self, split: str) -> ViewTable:
@@ -89,13 +111,9 @@ class PairDataModule(LightningDataModule):
         if split not in self._tables:
             views = self._on_disk(split)
             if split in ("train", "validation") and self.validation_views:
-                views = [self._validation_split(each, held_out=split == "validation") for each in views]
+                views = self._divided(views, held_out=split == "validation")
             self._tables[split] = ViewTable(views)
         return self._tables[split]
-
-    def names(self) -> list[str]:
-        """The objects of this data set, sorted: all whose views are in `path`."""
-        return object_names(self.path)
 
     def fingerprint(self, split: str) -> str:
         """A text that changes with what a split's batches are made of: its images, names, cameras and labels."""
@@ -109,20 +127,36 @@ class PairDataModule(LightningDataModule):
     def _on_disk(self, split: str) -> list[ObjectViews]:
         folder = _folder(split)
         if folder not in self._folders:
-            self._folders[folder] = [read_views(self.path, name, folder) for name in self.names()]
+            self._folders[folder] = [self.source.views(name, folder) for name in self.source.names()]
         return self._folders[folder]
 
-    def _validation_split(self, views: ObjectViews, held_out: bool) -> ObjectViews:
+    def _divided(self, views: Sequence[ObjectViews], held_out: bool) -> list[ObjectViews]:
+        """Of training views what is held out for validation, or the rest."""
+        if not self.validation_objects:
+            return [self._some(each, held_out, left=2) for each in views]
+        if self.validation_objects >= len(views):
+            raise UserError(
+                f"data.validation_objects={self.validation_objects} of {len(views)} objects leave none to train on"
+            )
+        names = sorted((each.name for each in views), key=lambda name: stable_id(f"{self.seed} {name}"))
+        drawn = names[: self.validation_objects]
+        chosen = [each for each in views if (each.name in drawn) == held_out]
+        return [self._some(each, held_out=True, left=0) for each in chosen] if held_out else chosen
+
+    def _some(self, views: ObjectViews, held_out: bool, left: int) -> ObjectViews:
+        """The `validation_views` of an object, or its others, of which at least `left` are wanted."""
         count = self.validation_views
-        if len(views) < count + 2:
+        if len(views) < count + left:
             raise UserError(
                 f"object '{views.name}' has {len(views)} training views; holding out data.validation_views={count} "
-                "leaves fewer than two to train on"
+                f"needs at least {count + left}"
             )
         order = np.random.default_rng([self.seed, len(views)]).permutation(len(views))
         kept = np.sort(order[:count] if held_out else order[count:])
         files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
         return replace(views, files=files, cameras=cameras)
+
+    # ------------------------------------------------------------ what is asked for
 
     def evaluate_on(self, protocol: str, seed: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
         """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
@@ -153,15 +187,9 @@ class PairDataModule(LightningDataModule):
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
         self._extractor = extractor
 
-    def _features(self, key: str, images: NDArray) -> NDArray | None:
-        if self._extractor is None:
-            return None
-        extractor, device = self._extractor, self._device()
-        shape = (len(images), extractor.trunk_dim)
-        feature_key = content_key([], "features", key, extractor.fingerprint())
-        return cached_array(
-            self.cache, feature_key, shape, np.float32, lambda array: _extract(extractor, images, array, device)
-        )
+    def carry(self, *what: Literal["alpha", "depth"]) -> None:
+        """From now on batches carry the views' alpha channels, or the depths that were rendered with them, as well."""
+        self._carried = {*what}
 
     # ------------------------------------------------------------ batches
 
@@ -172,12 +200,21 @@ class PairDataModule(LightningDataModule):
         files = [file for views in self._on_disk(split) for file in views.files]
         key, images = decoded_views(files, self.image_size, self.cache)
         self._image_keys[_folder(split)] = key
-        features = self._features(key, images)
+        arrays = {"images": images}
+        if "alpha" in self._carried:
+            arrays["alpha"] = decoded_alpha(files, self.image_size, self.cache, key)
+        if "depth" in self._carried:
+            arrays["depth"] = decoded_depths(files, self.image_size, self.cache)
+        if (extractor := self._extractor) is not None:
+            feature_key, device = content_key([], "features", key, extractor.fingerprint()), self._device()
+            arrays["features"] = cached_array(
+                self.cache, feature_key, len(files), lambda: _extracted(extractor, images, device)
+            )
         if files == table.files:
-            return PairData(table, images, features)
+            return PairData(table, **arrays)
         place = {file: row for row, file in enumerate(files)}
         rows = np.array([place[file] for file in table.files])
-        return PairData(table, Rows(images, rows), None if features is None else Rows(features, rows))
+        return PairData(table, **{name: Rows(array, rows) for name, array in arrays.items()})
 
     def _device(self) -> torch.device:
         """Where the networks are going to be."""
@@ -221,10 +258,11 @@ def _folder(split: str) -> str:
     return "test" if split == "test" else "train"
 
 
-def _extract(extractor: FeatureExtractor, images: NDArray, array: NDArray, device: torch.device) -> None:
-    batch = 32 if device.type == "cpu" else 256
+def _extracted(extractor: FeatureExtractor, images: NDArray, device: torch.device) -> Iterator[NDArray]:
+    count = 32 if device.type == "cpu" else 256
     extractor.to(device)  # not in inference mode: what is moved there cannot be trained any more
-    with torch.inference_mode():
-        for start in tracked(range(0, len(images), batch), "computing features"):
-            pixels = torch.tensor(images[start : start + batch]).to(device)  # a copy: the cache is read-only
-            array[start : start + batch] = extractor.trunk(as_images(pixels)).cpu().numpy()
+    for start in tracked(range(0, len(images), count), "computing features"):
+        with torch.inference_mode():
+            pixels = torch.tensor(images[start : start + count]).to(device)  # a copy: the cache is read-only
+            features = extractor.trunk(as_images(pixels)).cpu().numpy()
+        yield features

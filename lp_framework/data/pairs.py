@@ -23,10 +23,11 @@ PROTOCOLS = ("ordered", "per_view", "ifusion")
 class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
-    `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, D]` that a frozen backbone computed from them; `names` of the
+    `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, ...]` that a frozen backbone computed from them; `names` of the
     views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`;
     `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table, `numbers` `[P]` a
-    number for each ordered pair of rows.
+    number for each ordered pair of rows. Where they are asked for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]`
+    (float32) along the optical axis in scene units, 0 where there is nothing.
     """
 
     pixels: Tensor | None
@@ -39,6 +40,8 @@ class PairBatch:
     query: Tensor
     pairs: Tensor
     numbers: Tensor
+    alpha: Tensor | None = None
+    depth: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -143,21 +146,30 @@ class Rows:
 class PairData(Dataset[PairBatch]):
     """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
 
-    `images` (uint8) and `features` have a row a view of the table.
+    `images` (uint8), `features`, `alpha` and `depth`, where they are given, have a row a view of the table.
     """
 
-    def __init__(self, table: ViewTable, images: NDArray | Rows | None, features: NDArray | Rows | None) -> None:
-        self.table, self.images, self.features = table, images, features
+    def __init__(
+        self,
+        table: ViewTable,
+        images: NDArray | Rows | None,
+        features: NDArray | Rows | None = None,
+        alpha: NDArray | Rows | None = None,
+        depth: NDArray | Rows | None = None,
+    ) -> None:
+        self.table, self.images, self.features, self.alpha, self.depth = table, images, features, alpha, depth
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
         views, place = np.unique(pairs, return_inverse=True)
         place = place.reshape(pairs.shape)
         index = torch.from_numpy(views)
-        features = None if self.features is None else torch.from_numpy(self.features[views])
-        pixels = None if self.images is None or features is not None else torch.from_numpy(self.images[views])
+
+        def rows(array: NDArray | Rows | None) -> Tensor | None:
+            return None if array is None else torch.from_numpy(array[views])
+
         return PairBatch(
-            pixels=pixels,
-            features=features,
+            pixels=rows(self.images) if self.features is None else None,
+            features=rows(self.features),
             names=[self.table.view_names[view] for view in views],
             poses=self.table.poses[index],
             cameras=self.table.cameras[index],
@@ -166,6 +178,8 @@ class PairData(Dataset[PairBatch]):
             query=torch.from_numpy(place[:, 1]),
             pairs=torch.from_numpy(pairs),
             numbers=torch.from_numpy(pairs[:, 0] * len(self.table) + pairs[:, 1]),
+            alpha=rows(self.alpha),
+            depth=rows(self.depth),
         )
 
 

@@ -15,7 +15,8 @@ same share: it is about 0 where the object looks as large from both, negative wh
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,6 @@ from lp_framework.atomic import written
 from lp_framework.errors import UserError
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
-FIELD_OF_VIEW_DEGREES = 49.1  # of the virtual camera: that of the views on which the priors were trained
 HALF = 128  # opacity, of 255, from which on a pixel is the object's
 SMALLEST = 16  # pixels; a smaller object in a photograph says too little
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
@@ -79,15 +79,24 @@ def _images_in(folder: Path) -> list[Path]:
 # ---------------------------------------------------------------- reading
 
 
-def read_image(file: str | Path) -> Image.Image:
-    """An image file as `upright` has it; `UserError` naming the file where it cannot be read."""
+@contextmanager
+def opened(file: str | Path) -> Iterator[Image.Image]:
+    """An image file, of which only the head has been read; `UserError` naming the file where it cannot be read."""
     try:
         with Image.open(file) as image:
-            return upright(image)
+            yield image
+    except UserError:
+        raise
     except FileNotFoundError:
         raise UserError(f"{file}: there is no such image") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(f"{file}: is not a readable image ({error})") from error
+
+
+def read_image(file: str | Path) -> Image.Image:
+    """An image file as `upright` has it; `UserError` naming the file where it cannot be read."""
+    with opened(file) as image:
+        return upright(image)
 
 
 def upright(image: Image.Image) -> Image.Image:

@@ -21,9 +21,9 @@ import math
 import torch
 from torch import Tensor
 
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.geometry import camera_to_world, from_opencv, geodesic_angle, inverse, rigid_transform, view_pose
 
-FIELD_OF_VIEW_DEGREES = 49.1  # of the priors, and of rendered views
 NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from lp_framework.analysis.generated import generated_views
 from lp_framework.analysis.pairs import named_pairs, object_index, with_prior_energy
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.sources import RenderedData
+from lp_framework.data.sets.rendered import RenderedData
 from lp_framework.errors import UserError
 from lp_framework.figures.base import PaperFigure, checked_draws
 from lp_framework.geometry import apply_relative_pose, camera_to_world
@@ -81,11 +81,12 @@ class FailuresFigure(PaperFigure[FailureContents]):
 
     def rendered(self, name: str, poses: Tensor) -> NDArray | None:
         """Views `[K, H, W, 3]` in [0, 1] of an object's mesh from view poses `[K, 3]`; None where there is no mesh."""
-        if not isinstance(self.data, RenderedData):
+        source = self.data.source
+        if not isinstance(source, RenderedData):
             return None
-        scene = next(each for each in self.data.objects() if each.name == name).load()
+        scene = next(each for each in source.objects() if each.name == name).load()
         field_of_view = self.data.table("test").objects[object_index(self.data, name)].field_of_view
-        views = self.data.renderer.render(scene, camera_to_world(poses), RESOLUTION, math.degrees(field_of_view)) / 255
+        views = source.renderer.render(scene, camera_to_world(poses), RESOLUTION, math.degrees(field_of_view)) / 255
         alpha = views[..., 3:]
         return np.asarray(views[..., :3] * alpha + 1 - alpha)
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 
-import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lp_framework.data.rendering.pyrender_renderer import PyrenderRenderer, offscreen_context
 from lp_framework.data.rendering.raycast import RaycastRenderer
-from lp_framework.data.rendering.renderer import Renderer
+from lp_framework.data.rendering.renderer import Renderer, View
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -31,6 +30,6 @@ class AutoRenderer(Renderer):
 
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
-    ) -> Iterator[NDArray[np.uint8]]:
+    ) -> Iterator[View]:
         """See `Renderer.views`."""
         return self.chosen.views(scene, camera_to_world, resolution, field_of_view_degrees)

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from lp_framework.data.meshes import Surface, surfaces
-from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, downsample
+from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, View, downsample
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -36,7 +36,7 @@ class PyrenderRenderer(Renderer):
 
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
-    ) -> Iterator[NDArray[np.uint8]]:
+    ) -> Iterator[View]:
         """See `Renderer.views`."""
         context = offscreen_context()
         import pyrender
@@ -51,8 +51,7 @@ class PyrenderRenderer(Renderer):
         for pose in np.asarray(camera_to_world, dtype=np.float64):
             stage.set_pose(camera_node, pose)
             context.viewport_width = context.viewport_height = resolution * SUPERSAMPLING
-            samples, _ = context.render(stage, flags=pyrender.RenderFlags.RGBA)
-            yield downsample(samples)
+            yield downsample(*context.render(stage, flags=pyrender.RenderFlags.RGBA))
 
 
 def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:

@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from lp_framework.data.meshes import Surface, srgb_to_linear, surfaces
-from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, downsample
+from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, View, downsample
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -29,7 +29,7 @@ class RaycastRenderer(Renderer):
 
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
-    ) -> Iterator[NDArray[np.uint8]]:
+    ) -> Iterator[View]:
         """See `Renderer.views`."""
         try:
             from trimesh.ray.ray_pyembree import RayMeshIntersector
@@ -45,7 +45,7 @@ class RaycastRenderer(Renderer):
         side = resolution * SUPERSAMPLING
         step = 2 * np.tan(np.radians(field_of_view_degrees) / 2) / side  # of a sample, on the image plane at depth 1
         for pose in np.asarray(camera_to_world, dtype=np.float64):
-            samples = np.zeros((side * side, 4), np.uint8)
+            samples, depth = np.zeros((side * side, 4), np.uint8), np.zeros(side * side, np.float32)
             for start in range(0, side * side, RAYS_AT_ONCE):
                 index = np.arange(start, min(start + RAYS_AT_ONCE, side * side))
                 rays = _directions(index, side, step, pose)
@@ -56,10 +56,10 @@ class RaycastRenderer(Renderer):
                 for part, begin, end in zip(parts, first_triangle[:-1], first_triangle[1:], strict=True):
                     met = np.flatnonzero((triangle >= begin) & (triangle < end))
                     if len(met):
-                        colour = part.colours(triangle[met] - begin, rays[met], pose, step)
+                        colour, depth[index[met]] = part.seen(triangle[met] - begin, rays[met], pose, step)
                         samples[index[met], :3] = colour * 255 + 0.5
                         samples[index[met], 3] = 255
-            yield downsample(samples.reshape(side, side, 4))
+            yield downsample(samples.reshape(side, side, 4), depth.reshape(side, side))
 
 
 def _directions(index: NDArray[np.int64], side: int, step: float, pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -83,10 +83,10 @@ class _Part:
         self.gradient2 = np.cross(self.normal, edge1) / area
         self.mips = None if surface.texture is None else _Mips.of(surface.texture)
 
-    def colours(
+    def seen(
         self, triangle: NDArray[np.int64], rays: NDArray[np.float64], pose: NDArray[np.float64], step: float
-    ) -> NDArray[np.float32]:
-        """Colours `[n, 3]` in [0, 1], sRGB, where rays from the camera meet triangles of this surface."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Colours `[n, 3]` in [0, 1], sRGB, and depths `[n]` where rays from the camera meet triangles of this one."""
         surface, normal = self.surface, self.normal[triangle]
         facing = (normal * rays).sum(axis=1)
         facing = np.where(np.abs(facing) < 1e-12, 1e-12, facing)
@@ -118,7 +118,7 @@ class _Part:
         lit = _shade(shading_normal, -_unit(rays.astype(np.float32)), colour, pose)
         if surface.corner_colours is not None:
             lit = lit * interpolate(surface.corner_colours)
-        return np.clip(lit ** np.float32(1 / 2.2), 0, 1)
+        return np.clip(lit ** np.float32(1 / 2.2), 0, 1), (pose[:3, 3] - interpolate(surface.positions)) @ pose[:3, 2]
 
 
 def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:

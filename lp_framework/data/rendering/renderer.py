@@ -30,6 +30,14 @@ LIGHTS = (KEY, FILL)
 AMBIENT = 0.2
 
 
+class View(NamedTuple):
+    """A view: pixels `[H, W, 4]` (uint8) with straight alpha, transparent where the scene is not; and, of a renderer
+    that knows it, depth `[H, W]` (float32) along the optical axis in scene units, 0 where a pixel is transparent."""
+
+    pixels: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None = None
+
+
 class Renderer(ABC):
     """Draws views of scenes; pickled to worker processes, hence without state that cannot travel."""
 
@@ -38,9 +46,8 @@ class Renderer(ABC):
     @abstractmethod
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
-    ) -> Iterator[NDArray[np.uint8]]:
-        """Views of a scene, one `[H, W, 4]` after the other, H = W = `resolution`: RGBA with straight alpha,
-        transparent where the scene is not.
+    ) -> Iterator[View]:
+        """Views of a scene, one after the other, H = W = `resolution`.
 
         `camera_to_world` is `[V, 4, 4]`, OpenGL style (array or CPU tensor); pixels are square, the optical axis meets
         the image's centre. What needs to be set up for the scene is set up once. Surfaces are opaque and seen from
@@ -50,22 +57,24 @@ class Renderer(ABC):
     def render(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> NDArray[np.uint8]:
-        """All `views` at once, `[V, H, W, 4]`."""
-        return np.stack(list(self.views(scene, camera_to_world, resolution, field_of_view_degrees)))
+        """The pixels of all `views` at once, `[V, H, W, 4]`."""
+        views = self.views(scene, camera_to_world, resolution, field_of_view_degrees)
+        return np.stack([view.pixels for view in views])
 
 
-def downsample(samples: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Pixels `[H, W, 4]` with straight alpha from samples `[H s, W s, 4]` with premultiplied alpha, s = SUPERSAMPLING.
+def downsample(samples: NDArray[np.uint8], depth: NDArray[np.float32]) -> View:
+    """The view of samples `[H s, W s, 4]` with premultiplied alpha and their depths `[H s, W s]`, s = SUPERSAMPLING.
 
-    The mean over each pixel is taken with premultiplied alpha, so that no background bleeds into the edges.
+    The mean over each pixel is taken with premultiplied alpha, so that no background bleeds into the edges; its depth
+    is that of the nearest sample.
     """
-    height, width = samples.shape[0] // SUPERSAMPLING, samples.shape[1] // SUPERSAMPLING
-    sums = np.zeros((height, width, 4), np.uint16)
-    for row in range(SUPERSAMPLING):
-        for column in range(SUPERSAMPLING):
-            sums += samples[row::SUPERSAMPLING, column::SUPERSAMPLING]
+    steps = range(SUPERSAMPLING)
+    parts = [(slice(row, None, SUPERSAMPLING), slice(column, None, SUPERSAMPLING)) for row in steps for column in steps]
+    sums = np.add.reduce([samples[part] for part in parts], dtype=np.uint16)
     alpha = sums[..., 3:].astype(np.float32)
-    pixels = np.empty((height, width, 4), np.uint8)
+    pixels = np.empty(sums.shape, np.uint8)
     pixels[..., :3] = np.minimum(sums[..., :3] * (255 / np.maximum(alpha, 1)) + 0.5, 255)
     pixels[..., 3:] = alpha / SUPERSAMPLING**2 + 0.5
-    return pixels
+    farther = np.where(depth > 0, depth, np.inf)
+    nearest = np.minimum.reduce([farther[part] for part in parts])
+    return View(pixels, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32))

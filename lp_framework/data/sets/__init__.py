@@ -1,1 +1,5 @@
-"""Published data sets in their authors' own formats: which objects, and how their cameras become spherical poses."""
+"""Sources of views: meshes to render, and published data sets in their authors' own formats."""
+
+from lp_framework.data.sets import co3d, hopev2, omni3d, rendered, scanned
+
+__all__ = ["co3d", "hopev2", "omni3d", "rendered", "scanned"]

@@ -13,13 +13,11 @@ object, so its frame is taken from cameras, masks and point cloud (`object_frame
 
 from __future__ import annotations
 
-import gzip
-import json
 import math
 import os
-import zlib
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +27,11 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lp_framework.data.meshes import loading
 from lp_framework.data.photographs import HALF, read_image
+from lp_framework.data.reading import expecting, names_below, numbers, read_json
 from lp_framework.data.real_cameras import from_pytorch3d, ndc_intrinsics
-from lp_framework.data.sets.converted import Annotated, ConvertedData, Photograph
+from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.data.sets.object_frame import frame_of_points, frame_of_silhouettes
 from lp_framework.data.sets.object_lists import drawn, kept_lists
 from lp_framework.errors import UserError
@@ -44,7 +44,7 @@ BLACK = 8  # an image that is nowhere brighter is one that was blackened for the
 
 
 @register("data", "co3d")
-class CO3DData(ConvertedData):
+class CO3DData(PhotographedData):
     """CO3Dv2's single-sequence subset: crops around the object of each scene, converted into `views` on first use.
 
     `scenes` of the sequences in the set lists of `subsets` are taken, drawn with `split_seed` and kept in
@@ -61,17 +61,9 @@ class CO3DData(ConvertedData):
         test_views: int = 8,
         resolution: int = 512,
         split_seed: int = 0,
-        cache: str = "datasets/cache",
-        image_size: int = 256,
-        batch_pairs: int = 1024,
-        block: int = 8,
-        validation_views: int = 8,
-        seed: int = 0,
     ) -> None:
-        super().__init__(views, cache, image_size, batch_pairs, block, validation_views, seed)
-        self.source, self.subsets, self.scenes = Path(path), list(subsets), scenes
-        self.train_views, self.test_views = train_views, test_views
-        self.resolution, self.split_seed = resolution, split_seed
+        super().__init__(path, views, train_views, test_views, resolution, split_seed)
+        self.subsets, self.scenes = list(subsets), scenes
 
     def demands(self) -> dict[str, Any]:
         return {**super().demands(), "subsets": self.subsets}
@@ -80,19 +72,14 @@ class CO3DData(ConvertedData):
         """The scenes, `<category>-<sequence>`."""
         how = {"subsets": self.subsets, "scenes": self.scenes, "split_seed": self.split_seed}
         return kept_lists(
-            self.path, how, lambda: drawn(self._available(), self.scenes, 0, self.split_seed, self.source)
+            self.path, how, lambda: drawn(self._available(), self.scenes, 0, self.split_seed, self.download)
         ).seen
 
     def _available(self) -> list[str]:
-        if not self.source.is_dir():
-            raise UserError(f"{self.source}: there is no such folder; give data.path=FOLDER of CO3Dv2")
-        files = [file for folder in sorted(self.source.iterdir()) for file in self._set_lists(folder)]
-        if not files:
-            looked = ", ".join(f"{self.source}/*/set_lists/set_lists_{subset}.json" for subset in self.subsets)
-            raise UserError(f"{self.source}: has no set lists of CO3Dv2; looked for {looked}")
-        return sorted(
-            {f"{file.parents[1].name}-{sequence}" for file in files for sequence, _ in _frames_of_set_list(file)}
-        )
+        files = (file for folder in sorted(self.download.glob("*")) for file in self._set_lists(folder))
+        scenes = (f"{file.parents[1].name}-{sequence}" for file in files for sequence, _ in _frames_of_set_list(file))
+        looked_for = (f"{self.download}/*/set_lists/set_lists_{subset}.json" for subset in self.subsets)
+        return names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
 
     def _set_lists(self, folder: Path) -> list[Path]:
         """Those that a category has; not every one is in every subset."""
@@ -101,7 +88,7 @@ class CO3DData(ConvertedData):
 
     def photographs(self, name: str) -> Annotated:
         category, _, sequence = name.partition("-")
-        folder = self.source / category
+        folder = self.download / category
         listed = {
             number
             for file in self._set_lists(folder)
@@ -109,17 +96,12 @@ class CO3DData(ConvertedData):
             if found == sequence
         }
         file = folder / "frame_annotations.jgz"
-        frames = {
-            frame["frame_number"]: frame
-            for frame in _read_jgz(file)
-            if isinstance(frame, dict)
-            and frame.get("sequence_name") == sequence
-            and isinstance(frame.get("frame_number"), int)
-        }
+        annotated = _of_sequence(file, sequence)
+        frames = {each["frame_number"]: each for each in annotated if isinstance(each.get("frame_number"), int)}
         if missing := sorted(listed - frames.keys()):
             raise UserError(f"{file}: has no frame {missing[0]} of sequence '{sequence}', which the set list names")
-        photographs = [_photograph(frames[number], self.source, file) for number in sorted(listed)]
-        cloud, scores = _of_sequence(folder / "sequence_annotations.jgz", sequence, self.source)
+        photographs = [_photograph(frames[number], self.download, file) for number in sorted(listed)]
+        cloud, scores = _cloud_and_scores(folder / "sequence_annotations.jgz", sequence, self.download)
         try:
             return _in_object_frame(photographs, cloud, scores)
         except UserError as error:
@@ -131,47 +113,30 @@ class CO3DData(ConvertedData):
 
 def _frames_of_set_list(file: Path) -> list[tuple[str, int]]:
     """Sequence and frame number of every frame in a set list, whatever part it is in."""
-    try:
-        content = json.loads(file.read_bytes())
+    content = read_json(file)
+    with expecting(f"{file}: is no set list of CO3Dv2"):
         return [(str(sequence), int(number)) for frames in content.values() for sequence, number, _ in frames]
-    except FileNotFoundError:
-        raise UserError(f"{file}: there is no such set list") from None
-    except (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise UserError(f"{file}: is no set list of CO3Dv2 ({type(error).__name__}: {error})") from error
 
 
-def _read_jgz(file: Path) -> list[Any]:
-    try:
-        with gzip.open(file) as opened:
-            content = json.loads(opened.read())
-    except FileNotFoundError:
-        raise UserError(f"{file}: there is no such file; every category of CO3Dv2 has one") from None
-    except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
-        raise UserError(f"{file}: is not readable gzipped JSON ({error})") from error
+def _of_sequence(file: Path, sequence: str) -> list[dict[str, Any]]:
+    """The entries of a file of annotations that are of a sequence."""
+    content = read_json(file)
     if not isinstance(content, list):
-        raise UserError(f"{file}: must hold a list of frames")
-    return content
+        raise UserError(f"{file}: must hold a list of frames or sequences")
+    return [each for each in content if isinstance(each, dict) and each.get("sequence_name") == sequence]
 
 
 def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
     """A frame as annotated, its camera still in the world of its sequence."""
     where = f"{file}: frame {frame['frame_number']} of sequence '{frame['sequence_name']}'"
-    try:
+    with expecting(f"{where} needs image, mask and viewpoint with R, T, focal_length and principal_point"):
         view, (height, width) = frame["viewpoint"], frame["image"]["size"]
-        rotation, translation, focal, principal = (
-            torch.tensor(view[key], dtype=torch.float64) for key in ("R", "T", "focal_length", "principal_point")
-        )
+        rotation, translation = numbers(view["R"], 3, 3), numbers(view["T"], 3)
+        focal, principal = numbers(view["focal_length"], 2), numbers(view["principal_point"], 2)
         image, mask = root / frame["image"]["path"], root / frame["mask"]["path"]
         size = (int(width), int(height))
-        form = view.get("intrinsics_format", "ndc_norm_image_bounds")
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
-        raise UserError(
-            f"{where} needs image, mask and viewpoint with R, T, focal_length and principal_point "
-            f"({type(error).__name__}: {error})"
-        ) from error
-    shapes = [list(each.shape) for each in (rotation, translation, focal, principal)]
-    numbers = torch.cat([each.flatten() for each in (rotation, translation, focal, principal)])
-    if shapes != [[3, 3], [3], [2], [2]] or not numbers.isfinite().all():
+        form = str(view.get("intrinsics_format", "ndc_norm_image_bounds"))
+    if rotation is None or translation is None or focal is None or principal is None:
         raise UserError(f"{where} has no camera of finite numbers: R 3 x 3, T 3, focal_length 2, principal_point 2")
     if not is_rotation(rotation):
         raise UserError(f"{where}: R is not a rotation")
@@ -182,29 +147,24 @@ def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
     for found in (image, mask):
         if not os.path.isfile(found):  # unlike Path.is_file, False for an impossible name
             raise UserError(f"{found}: there is no such file")
-    return Photograph(
-        image, mask, from_pytorch3d(rotation, translation), ndc_intrinsics(focal, principal, size, FORMATS[form]), size
-    )
+    camera, intrinsics = from_pytorch3d(rotation, translation), ndc_intrinsics(focal, principal, size, FORMATS[form])
+    return Photograph(image, mask, camera, intrinsics, size)
 
 
-def _of_sequence(file: Path, sequence: str, root: Path) -> tuple[Path | None, dict[str, float | None]]:
+def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | None, dict[str, float | None]]:
     """The point cloud of a sequence, None where there is none, and the scores of its cameras and cloud (the larger the
     better; None where not on record)."""
-    found = [each for each in _read_jgz(file) if isinstance(each, dict) and each.get("sequence_name") == sequence]
+    found = _of_sequence(file, sequence)
     if not found:
         raise UserError(f"{file}: has no sequence '{sequence}', which the set list names")
-    cloud = found[0].get("point_cloud") or {}
-    try:
+    wanted = "needs point_cloud with path and quality_score, or null, and viewpoint_quality_score"
+    with expecting(f"{file}: sequence '{sequence}' {wanted}"):
+        cloud = found[0].get("point_cloud") or {}
         path = root / cloud["path"] if cloud else None
         scores = {
             "viewpoint_quality_score": _score(found[0].get("viewpoint_quality_score")),
             "point_cloud_quality_score": _score(cloud.get("quality_score")),
         }
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise UserError(
-            f"{file}: sequence '{sequence}' needs point_cloud with path and quality_score, or null, and "
-            f"viewpoint_quality_score ({type(error).__name__}: {error})"
-        ) from error
     return path if path is not None and os.path.isfile(path) else None, scores
 
 
@@ -237,20 +197,15 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
     if cloud is not None:
         from_cloud = frame_of_points(cameras, read_points(cloud))
         frame, source = (from_cloud, "point cloud") if from_cloud.agrees(frame) else (frame, source)
-    moved = [
-        Photograph(each.file, each.mask, camera, each.intrinsics, each.size)
-        for each, camera in zip(whole, frame.camera(cameras), strict=True)
-    ]
+    moved = [replace(each, camera=camera) for each, camera in zip(whole, frame.camera(cameras), strict=True)]
     return Annotated(moved, frame.corners(), left_out, {"object_frame": source, **scores})
 
 
 def read_points(file: Path) -> Tensor:
     """The points `[P, 3]` (float64) of a PLY file; `UserError` naming it where it does not load or has fewer than 3."""
-    try:
+    with loading(file, "a point cloud"):
         loaded: Any = trimesh.load(file, process=False)
         points = np.asarray(loaded.vertices, dtype=np.float64)
-    except Exception as error:  # the parsers of trimesh raise anything from KeyError to struct.error
-        raise UserError(f"{file}: does not load as a point cloud ({type(error).__name__}: {error})") from error
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
         raise UserError(f"{file}: a point cloud has three or more points of finite numbers, got {list(points.shape)}")
     return torch.from_numpy(points)
@@ -258,13 +213,7 @@ def read_points(file: Path) -> Tensor:
 
 def mask_pixels(photograph: Photograph) -> NDArray[np.float64]:
     """Centres `[M, 2]` (x, y; pixels) of the outermost object pixels in each row and column of a photograph's mask."""
-    mask = read_image(photograph.mask).convert("L")
-    if mask.size != photograph.size:
-        width, height = photograph.size
-        raise UserError(
-            f"{photograph.mask}: is {mask.width} x {mask.height} pixels, the photograph should be {width} x {height}"
-        )
-    inside = np.asarray(mask) >= HALF
+    inside = np.asarray(photograph.read(photograph.mask, "L")) >= HALF
     outline = inside & ~(
         np.pad(inside, 1)[1:-1, :-2] & np.pad(inside, 1)[1:-1, 2:]
         & np.pad(inside, 1)[:-2, 1:-1] & np.pad(inside, 1)[2:, 1:-1]

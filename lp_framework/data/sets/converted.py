@@ -1,8 +1,7 @@
 """Photographs with cameras, converted once into views on disk; everything after that is as with rendered views.
 
 A data set says which photographs an object has, where their cameras are and how large the object is. From them come
-object-centric crops by `real_cameras`, chosen so that their viewpoints are spread evenly. An object is written into a
-hidden folder that is renamed when all of it is there; the download itself is only read. `conversion.json` beside an
+object-centric crops by `real_cameras`, chosen so that their viewpoints are spread evenly. `conversion.json` beside an
 object's views says what they were made from and what was left out.
 
 Beside what every `transform.json` has, a frame keeps its photograph (`source`, `width`, `height`), its camera
@@ -12,29 +11,32 @@ Beside what every `transform.json` has, a frame keeps its photograph (`source`, 
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import shutil
 import warnings
+from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from filelock import FileLock
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
 from lp_framework.data.cache import tracked
-from lp_framework.data.module import PairDataModule
+from lp_framework.data.object_folders import (
+    differences,
+    locked,
+    raise_failures,
+    read_record,
+    write_object,
+    write_transforms,
+)
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.real_cameras import (
-    FIELD_OF_VIEW_DEGREES,
     crop_field_of_view,
     crop_homography,
     effective_radii,
@@ -43,6 +45,7 @@ from lp_framework.data.real_cameras import (
     turn_towards_centre,
 )
 from lp_framework.data.sets.object_lists import LIST
+from lp_framework.data.source import ViewSource
 from lp_framework.errors import UserError
 from lp_framework.geometry import to_ifusion, view_pose
 from lp_framework.keyed_random import stable_id
@@ -63,6 +66,14 @@ class Photograph:
     intrinsics: Tensor
     size: tuple[int, int]
 
+    def read(self, file: Path, mode: str) -> Image.Image:
+        """The photograph or its mask; `UserError` where it cannot be read and where its size is another."""
+        image = read_image(file).convert(mode)
+        if image.size != self.size:
+            (width, height), (wide, high) = image.size, self.size
+            raise UserError(f"{file}: is {width} x {height} pixels, the photograph should be {wide} x {high}")
+        return image
+
 
 class Annotated(NamedTuple):
     """What a data set says of an object: photographs, `points` `[P, 3]` on its bounding box, how many photographs were
@@ -74,46 +85,78 @@ class Annotated(NamedTuple):
     remarks: dict[str, Any]
 
 
-class ConvertedData(PairDataModule):
-    """Views that are converted from photographs on first use.
+class ConvertedSource(ViewSource):
+    """Views that are converted from those of a download on first use.
 
-    `source` is the download, `path` the folder of views. `train_views` and `test_views` photographs of each object are
-    taken, chosen with `split_seed`; their crops are `resolution` pixels a side.
+    `download` is its folder, which is only read, and `path` that of the views.
     """
 
-    source: Path
-    train_views: int
-    test_views: int
-    resolution: int
-    split_seed: int
+    download: Path
 
-    def photographs(self, name: str) -> Annotated:
-        """An object's photographs and its extent, in the object's frame."""
-        raise NotImplementedError
+    @abstractmethod
+    def convert(self, name: str) -> None:
+        """Write the views of an object by `write`."""
 
     def demands(self) -> dict[str, Any]:
         """What of the settings decides an object's views, as plain values."""
-        return {
-            "source": self.source.resolve().name,
-            "train_views": self.train_views,
-            "test_views": self.test_views,
-            "resolution": self.resolution,
-            "split_seed": self.split_seed,
-        }
+        return {"source": self.download.resolve().name}
 
-    def prepare_data(self) -> None:
-        """Convert what is not there yet, then as every data set."""
-        self._check_settings()
-        convert_objects(self.path, self.names, self.demands(), self._convert)
-        super().prepare_data()
+    def prepare(self) -> None:
+        """Convert what is missing, one object after another.
 
-    def _check_settings(self) -> None:
-        counts = (("train_views", self.train_views, 2), ("test_views", self.test_views, 2))
-        for name, value, least in (*counts, ("resolution", self.resolution, 16)):
+        A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
+        """
+        failures: dict[str, str] = {}
+        with locked(self.path, ".convert.lock"):
+            objects = self.names()
+            missing = [name for name in objects if not is_converted(self.path / name, self.demands())]
+            for name in tracked(missing, "converting photographs"):
+                try:
+                    self.convert(name)
+                except UserError as error:
+                    failures[name] = str(error)
+        listed = self.path / LIST
+        how = f"; mend them, or take their names out of {listed}" if listed.is_file() else ""
+        raise_failures(failures, len(objects), f"converted{how}")
+
+    def write(self, name: str, record: Mapping[str, Any], write: Callable[[Path], None]) -> None:
+        """Have an object's views written, with their record, whole or not at all; `UserError` where some are there."""
+        folder = self.path / name
+        if folder.exists():
+            raise UserError(
+                f"{folder}: holds other views than these settings make (see its {RECORD}); choose another data.views "
+                "or delete it"
+            )
+        write_object(folder, RECORD, {"object": name, **self.demands(), **record}, write)
+
+
+class PhotographedData(ConvertedSource):
+    """Object-centric crops of photographs with cameras.
+
+    `train_views` and `test_views` photographs of each object are taken, chosen with `split_seed`; their crops are
+    `resolution` pixels a side.
+    """
+
+    def __init__(
+        self, path: str, views: str, train_views: int, test_views: int, resolution: int, split_seed: int
+    ) -> None:
+        counts = (("train_views", train_views, 2), ("test_views", test_views, 2), ("resolution", resolution, 16))
+        for name, value, least in counts:
             if value < least:
                 raise UserError(f"data.{name} must be at least {least}, got {value}")
+        self.download, self.path = Path(path), Path(views)
+        self.train_views, self.test_views = train_views, test_views
+        self.resolution, self.split_seed = resolution, split_seed
 
-    def _convert(self, name: str) -> None:
+    @abstractmethod
+    def photographs(self, name: str) -> Annotated:
+        """An object's photographs and its extent, in the object's frame."""
+
+    def demands(self) -> dict[str, Any]:
+        names = ("train_views", "test_views", "resolution", "split_seed")
+        return {**super().demands(), **{name: getattr(self, name) for name in names}}
+
+    def convert(self, name: str) -> None:
         photographs, points, left_out, remarks = self.photographs(name)
         views, more = sound_views(photographs, points)
         left_out += more
@@ -121,12 +164,12 @@ class ConvertedData(PairDataModule):
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items()))
         if len(views) < wanted:
             raise UserError(
-                f"{self.source}: object '{name}' has {len(views)} usable views"
+                f"{self.download}: object '{name}' has {len(views)} usable views"
                 f"{f' ({reasons} are left out)' if reasons else ''}, but data.train_views={self.train_views} and "
                 f"data.test_views={self.test_views} ask for {wanted}"
             )
         if reasons:
-            warnings.warn(f"{self.source}: object '{name}': {reasons} are left out", stacklevel=2)
+            warnings.warn(f"{self.download}: object '{name}': {reasons} are left out", stacklevel=2)
         places = torch.stack([view.photograph.camera[:3, 3] for view in views])
         directions = torch.nn.functional.normalize(places, dim=-1).numpy()
         random = np.random.default_rng([self.split_seed, stable_id(name)])
@@ -138,8 +181,6 @@ class ConvertedData(PairDataModule):
         }
         residuals = [view.residual for split in splits.values() for view in split]
         record = {
-            "object": name,
-            **self.demands(),
             **remarks,
             "left_out": dict(left_out),
             "median_perspective_residual": float(np.median(residuals)),
@@ -154,75 +195,16 @@ class ConvertedData(PairDataModule):
                 for index, view in enumerate(chosen_views):
                     file = f"{index:03d}.png"
                     crop(view, self.resolution).save(folder / split / "rgb" / file, compress_level=1)
-                    frames.append({"file_path": file, **view.frame(self.source)})
+                    frames.append({"file_path": file, **view.frame(self.download)})
                 write_transforms(folder / split, frames)
 
-        write_converted(self.path / name, record, write)
+        self.write(name, record, write)
 
 
-def convert_objects(
-    folder: Path, names: Callable[[], list[str]], demands: dict[str, Any], convert: Callable[[str], None]
-) -> None:
-    """Have the objects converted that `folder` does not hold yet, one after another.
-
-    A `UserError` of one object does not stop the others; at the end one `UserError` lists them all. `names` is called
-    while no other run converts into the folder.
-    """
-    failures: dict[str, list[str]] = {}  # names by what is wrong: what all objects share is said once
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / ".convert.lock"):
-            objects = names()
-            missing = [name for name in objects if not is_converted(folder / name, demands)]
-            for name in tracked(missing, "converting photographs"):
-                try:
-                    convert(name)
-                except UserError as error:
-                    failures.setdefault(str(error), []).append(name)
-    except OSError as error:
-        raise UserError(
-            f"{folder}: cannot be written ({error.strerror}); the objects finished so far are kept"
-        ) from error
-    if failures:
-        how = f"; mend them, or take their names out of {folder / LIST}" if (folder / LIST).is_file() else ""
-        told = [f"{', '.join(names_of)}: {failure}" for failure, names_of in failures.items()]
-        raise UserError(
-            f"{sum(map(len, failures.values()))} of {len(objects)} objects could not be converted{how}:"
-            + (f" {told[0]}" if len(told) == 1 else "".join(f"\n  {each}" for each in told))
-        )
-
-
-def write_transforms(folder: Path, frames: list[dict[str, Any]]) -> None:
-    """The `transform.json` of a split with the priors' field of view."""
-    content = {"camera_angle_x": math.radians(FIELD_OF_VIEW_DEGREES), "frames": frames}
-    (folder / "transform.json").write_text(json.dumps(content, indent=1))
-
-
-def is_converted(folder: Path, demands: dict[str, Any]) -> bool:
+def is_converted(folder: Path, demands: Mapping[str, Any]) -> bool:
     """Whether a folder holds an object's views that were made as its record, and `demands`, say."""
-    try:
-        record = json.loads((folder / RECORD).read_text())
-        return all(record[key] == value for key, value in demands.items())
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
-
-
-def write_converted(folder: Path, record: dict[str, Any], write: Callable[[Path], None]) -> None:
-    """Have an object's views written, with their record, whole or not at all; `UserError` where the folder is there."""
-    if folder.exists():
-        raise UserError(
-            f"{folder}: holds other views than these settings make (see its {RECORD}); choose another data.views or "
-            "delete it"
-        )
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
-    try:
-        partial.mkdir()
-        write(partial)
-        (partial / RECORD).write_text(json.dumps(record, indent=1))
-        os.rename(partial, folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    record = read_record(folder / RECORD)
+    return bool(record) and not differences(record, demands)
 
 
 # ---------------------------------------------------------------- choosing
@@ -299,15 +281,10 @@ def spread(directions: NDArray[np.floating], count: int, random: np.random.Gener
 
 def crop(view: SphericalView, size: int) -> Image.Image:
     """The object-centric crop of a photograph, RGBA of `size` pixels a side, transparent where the mask is dark and
-    beyond the photograph. `UserError` for a file that cannot be read and for a size that is not the annotation's."""
+    beyond the photograph."""
     photograph = view.photograph
-    image, mask = read_image(photograph.file).convert("RGB"), read_image(photograph.mask).convert("L")
-    for file, found in ((photograph.file, image.size), (photograph.mask, mask.size)):
-        if found != photograph.size:
-            width, height = photograph.size
-            raise UserError(f"{file}: is {found[0]} x {found[1]} pixels, the photograph should be {width} x {height}")
-    cut = image.convert("RGBA")
-    cut.putalpha(mask)
+    cut = photograph.read(photograph.file, "RGB")
+    cut.putalpha(photograph.read(photograph.mask, "L"))
     homography = crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
     # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing.
     larger = max(1, math.ceil(_magnification(homography, size) - 0.05))

@@ -56,16 +56,14 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
 def _label(label: Any, where: str) -> Label:
     if not isinstance(label, dict) or "ambiguity" not in label:
         raise UserError(f"{where} needs ambiguity: {', '.join(CLASSES[:-1])} or {CLASSES[-1]}")
-    ambiguity: Any
-    ambiguity, unique_answer, reason = (label.get(key) for key in KEYS)
-    if unknown := [key for key in label if key not in KEYS]:
-        raise UserError(f"{where}: {unknown[0]!r} is none of {', '.join(KEYS)}{nearest(str(unknown[0]), KEYS)}")
-    if ambiguity not in CLASSES:
-        raise UserError(
-            f"{where}: ambiguity {ambiguity!r} is none of {', '.join(CLASSES)}{nearest(str(ambiguity), CLASSES)}"
-        )
-    if unique_answer is not None and not isinstance(unique_answer, bool):
-        raise UserError(f"{where}: unique_answer must be true or false, got {unique_answer!r}")
-    if reason is not None and not isinstance(reason, str):
-        raise UserError(f"{where}: reason must be a text, got {reason!r}")
-    return Label(ambiguity, unique_answer)
+    for key, value in label.items():
+        if key not in KEYS:
+            raise UserError(f"{where}: {key!r} is none of {', '.join(KEYS)}{nearest(str(key), KEYS)}")
+        if key == "ambiguity" and value not in CLASSES:
+            known = f"{', '.join(CLASSES)}{nearest(str(value), CLASSES)}"
+            raise UserError(f"{where}: ambiguity {value!r} is none of {known}")
+        if key == "unique_answer" and not isinstance(value, bool | None):
+            raise UserError(f"{where}: unique_answer must be true or false, got {value!r}")
+        if key == "reason" and not isinstance(value, str | None):
+            raise UserError(f"{where}: reason must be a text, got {value!r}")
+    return Label(label["ambiguity"], label.get("unique_answer"))

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock
 
 from lp_framework.atomic import written
+from lp_framework.data.object_folders import differences, locked, read_record
 from lp_framework.errors import UserError
 
 LIST = "objects.json"
@@ -61,31 +61,18 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
     path = views / LIST
     if not path.exists():
         lists = choose()
-        try:
-            views.mkdir(parents=True, exist_ok=True)
-            with FileLock(views / ".objects.lock"):
-                if not path.exists():
-                    content = {"chosen": how, "seen": lists.seen, "unseen": lists.unseen}
-                    with written(path) as partial:
-                        partial.write_text(json.dumps(content, indent=1))
-        except OSError as error:
-            raise UserError(f"{views}: cannot be written ({error.strerror}); choose another folder") from error
-    try:
-        content = json.loads(path.read_text())
-        found, lists = dict(content["chosen"]), ObjectLists(_names(content["seen"]), _names(content["unseen"]))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise UserError(f"{path}: is no list of objects as this program writes it; delete it to choose anew") from error
-    differences = [
-        f"{key} was {found.get(key)}, is {how.get(key)}" for key in {**found, **how} if found.get(key) != how.get(key)
-    ]
-    if differences:
-        raise UserError(
-            f"{path}: its objects were chosen otherwise ({'; '.join(differences)}); choose another folder of views"
-        )
-    return lists
+        with locked(views, ".objects.lock"):
+            if not path.exists():
+                with written(path) as partial:
+                    partial.write_text(json.dumps({"chosen": how, **vars(lists)}, indent=1))
+    content = read_record(path)
+    found, seen, unseen = content.get("chosen"), _names(content.get("seen")), _names(content.get("unseen"))
+    if not isinstance(found, dict) or seen is None or unseen is None:
+        raise UserError(f"{path}: is no list of objects as this program writes it; delete it to choose anew")
+    if changed := differences(found, how):
+        raise UserError(f"{path}: its objects were chosen otherwise ({changed}); choose another folder of views")
+    return ObjectLists(seen, unseen)
 
 
-def _names(value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise TypeError(f"a list of names is wanted, not {value!r}")
-    return value
+def _names(value: Any) -> list[str] | None:
+    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else None

@@ -12,71 +12,52 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.data.module import PairDataModule
+from lp_framework.data.object_folders import write_transforms
 from lp_framework.data.photographs import read_image
+from lp_framework.data.reading import check_upright, names_below
 from lp_framework.data.real_cameras import z_up_to_y_up
-from lp_framework.data.sets.converted import convert_objects, write_converted, write_transforms
-from lp_framework.data.views import LARGEST_RESIDUAL, ObjectViews
+from lp_framework.data.sets.converted import ConvertedSource
+from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
-from lp_framework.geometry import is_rotation, rigid_transform, spherical_residual, to_ifusion, view_pose
+from lp_framework.geometry import rigid_transform, to_ifusion, view_pose
 from lp_framework.registry import register
 
 RADIUS = 1.85
 
 
 @register("data", "omni3d")
-class Omni3DData(PairDataModule):
+class Omni3DData(ConvertedSource):
     """Views in ID-Pose's layout, all of them test views; converted into `views` on first use."""
 
-    def __init__(
-        self,
-        path: str,
-        views: str | None = None,
-        cache: str = "datasets/cache",
-        image_size: int = 256,
-        batch_pairs: int = 1024,
-        block: int = 8,
-        validation_views: int = 8,
-        seed: int = 0,
-    ) -> None:
-        self.source = Path(path)
-        folder = views if views is not None else f"datasets/{self.source.resolve().name}"
-        super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
+    def __init__(self, path: str, views: str | None = None) -> None:
+        self.download = Path(path)
+        self.path = Path(views or f"datasets/{self.download.resolve().name}")
 
     def names(self) -> list[str]:
         """The objects of the download, sorted."""
-        return omni3d_objects(self.source)
+        return omni3d_objects(self.download)
 
-    def prepare_data(self) -> None:
-        """Convert what is not there yet, then as every data set."""
-        convert_objects(self.path, self.names, self._demands(), self._convert)
-        super().prepare_data()
-
-    def _demands(self) -> dict[str, Any]:
-        return {"source": self.source.resolve().name}
-
-    def _on_disk(self, split: str) -> list[ObjectViews]:
+    def views(self, name: str, split: str) -> ObjectViews:
         if split != "test":
             raise UserError(
-                f"{self.source}: data=omni3d has test views only, so there is nothing to train on; "
+                f"{self.download}: data=omni3d has test views only, so there is nothing to train on; "
                 "evaluate on it, or train on other data"
             )
-        return super()._on_disk(split)
+        return super().views(name, split)
 
-    def _convert(self, name: str) -> None:
-        cameras = omni3d_cameras(self.source, name)
+    def convert(self, name: str) -> None:
+        cameras = omni3d_cameras(self.download, name)
 
         def write(folder: Path) -> None:
             (folder / "test" / "rgb").mkdir(parents=True)
             frames = []
             for view, camera in cameras.items():
-                file = self.source / name / "images" / f"{view}.png"
+                file = self.download / name / "images" / f"{view}.png"
                 image = read_image(file)
                 if image.mode != "RGBA":
                     raise UserError(f"{file}: has no transparent background (alpha channel)")
@@ -87,18 +68,14 @@ class Omni3DData(PairDataModule):
                 frames.append({"file_path": f"{view}.png", "transform_matrix": camera.tolist(), "latlon": latlon})
             write_transforms(folder / "test", frames)
 
-        write_converted(self.path / name, {"object": name, **self._demands()}, write)
+        self.write(name, {}, write)
 
 
 def omni3d_objects(root: str | Path) -> list[str]:
     """Names of the objects below `root`, sorted: those with a folder of poses; `UserError` where there are none."""
     root = Path(root)
-    if not root.is_dir():
-        raise UserError(f"{root}: there is no such folder; give data.path=FOLDER with OBJECT/images and OBJECT/poses")
-    names = sorted(folder.name for folder in root.iterdir() if (folder / "poses").is_dir())
-    if not names:
-        raise UserError(f"{root}: holds no views in ID-Pose's layout; looked for {root}/OBJECT/poses/*.npy")
-    return names
+    names = (folder.name for folder in root.glob("*") if (folder / "poses").is_dir())
+    return names_below(root, names, "views in ID-Pose's layout", f"{root}/OBJECT/poses/*.npy")
 
 
 def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
@@ -124,16 +101,7 @@ def _camera(file: Path) -> Tensor:
         raise UserError(f"{file}: is not a readable array ({' '.join(str(error).split())})") from error
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise UserError(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers, got {list(matrix.shape)}")
-    rotation = torch.from_numpy(matrix[:3, :3])
-    if not is_rotation(rotation):
-        raise UserError(f"{file}: is not a rigid camera-to-world transform")
-    camera = z_up_to_y_up(rigid_transform(rotation, torch.from_numpy(matrix[:3, 3])))
-    if not camera[:3, 3].norm() > 1e-6:
-        raise UserError(f"{file}: its camera must stand off the origin")
-    residual = spherical_residual(camera).item()
-    if not residual <= LARGEST_RESIDUAL:
-        raise UserError(
-            f"{file}: its camera does not look at the origin with +Z up (it is {residual:.1f} degrees off, "
-            f"{LARGEST_RESIDUAL:g} are allowed)"
-        )
+    rows = torch.from_numpy(matrix)
+    camera = z_up_to_y_up(rigid_transform(rows[:3, :3], rows[:3, 3]))
+    check_upright(camera, f"{file}: its camera", up="+Z")
     return camera

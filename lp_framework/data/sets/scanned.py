@@ -7,20 +7,20 @@ seeded. It is written to `objects.json` beside the views and read from there aft
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import abstractmethod
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
-from lp_framework.data.meshes import MeshObject, load_scene, normalise
+from lp_framework.data.meshes import MeshObject, load_scene, loading, normalise
+from lp_framework.data.reading import names_below
 from lp_framework.data.rendering.renderer import Renderer
-from lp_framework.data.rendering.views import ViewProtocol
 from lp_framework.data.sets.object_lists import ObjectLists, drawn, kept_lists
-from lp_framework.data.sources import RenderedData
+from lp_framework.data.sets.rendered import RenderedData
 from lp_framework.data.views import object_names
 from lp_framework.errors import UserError
 from lp_framework.registry import register
@@ -35,7 +35,9 @@ class ScannedData(RenderedData):
     The views go to `views`, by default `datasets/` and the name of the `release`.
     """
 
-    release: str
+    release: ClassVar[str]
+    what: ClassVar[str]  # there is in the download
+    meshes_of_release: ClassVar[str]  # where, as a pattern; the objects are named by the folder of the mesh's folder
 
     def __init__(
         self,
@@ -49,39 +51,34 @@ class ScannedData(RenderedData):
         split_seed: int = 0,
         resolution: int = 512,
         test_views: int = 8,
+        train_views: int | None = None,
         latitude_step_degrees: float = 7.5,
         longitude_step_degrees: float = 15.0,
+        depth: bool = False,
         workers: int | None = None,
-        cache: str = "datasets/cache",
-        image_size: int = 256,
-        batch_pairs: int = 1024,
-        block: int = 8,
-        validation_views: int = 8,
-        seed: int = 0,
     ) -> None:
-        folder = views if views is not None else f"datasets/{self.release}"
-        super().__init__(folder, cache, image_size, batch_pairs, block, validation_views, seed)
         self.meshes, self.renderings = Path(path), None if renderings is None else Path(renderings)
         self.seen, self.unseen, self.which, self.split_seed = seen, unseen, objects, split_seed
-        self.renderer, self.workers = renderer, workers
-        self.protocol = ViewProtocol(
-            resolution=resolution,
-            test_views=test_views,
-            latitude_step_degrees=latitude_step_degrees,
-            longitude_step_degrees=longitude_step_degrees,
-        )
+        super().__init__(
+            renderer, views or f"datasets/{self.release}", workers, resolution=resolution, test_views=test_views,
+            train_views=train_views, latitude_step_degrees=latitude_step_degrees,
+            longitude_step_degrees=longitude_step_degrees, depth=depth,
+        )  # fmt: skip
+
+    @abstractmethod
+    def file(self, name: str) -> Path:
+        """The mesh of an object."""
+
+    @staticmethod
+    @abstractmethod
+    def load(path: Path) -> trimesh.Scene:
+        """An object's normalised scene, +Y up."""
 
     def available(self) -> list[str]:
         """Names of the objects in the download; `UserError`, with the file looked for, where there are none."""
-        raise NotImplementedError
-
-    def file(self, name: str) -> Path:
-        """The mesh of an object."""
-        raise NotImplementedError
-
-    def loader(self, name: str) -> Callable[[], trimesh.Scene]:
-        """What loads an object's normalised scene, +Y up."""
-        raise NotImplementedError
+        names = (file.parts[-3] for file in self.meshes.glob(self.meshes_of_release))
+        sound = (name for name in names if self.file(name).is_file())
+        return names_below(self.meshes, sound, self.what, self.meshes / self.meshes_of_release)
 
     def objects(self) -> list[MeshObject]:
         """The seen or unseen objects, sorted by name."""
@@ -92,7 +89,7 @@ class ScannedData(RenderedData):
             "renderings": None if self.renderings is None else self.renderings.name,
         }
         names = kept_lists(self.path, how, self._choose).named(self.which)
-        return [MeshObject(name, "unlabelled", self.loader(name)) for name in names]
+        return [MeshObject(name, "unlabelled", partial(self.load, self.file(name))) for name in names]
 
     def _choose(self) -> ObjectLists:
         available = self.available()
@@ -109,51 +106,6 @@ class ScannedData(RenderedData):
             return ObjectLists(seen, [])
         others = [name for name in available if name not in seen]
         return ObjectLists(seen, drawn(others, 0, self.unseen, self.split_seed, self.meshes).unseen)
-
-
-@register("data", "gso")
-class GSOData(ScannedData):
-    """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
-
-    release = "gso"
-
-    def available(self) -> list[str]:
-        """Names of the folders with a mesh."""
-        if not self.meshes.is_dir():
-            raise UserError(f"{self.meshes}: there is no such folder; give data.path=FOLDER with the objects of GSO")
-        names = sorted(file.parts[-3] for file in self.meshes.glob("*/meshes/model.obj"))
-        if not names:
-            raise UserError(f"{self.meshes}: holds no object of GSO; looked for {self.file('OBJECT')}")
-        return names
-
-    def file(self, name: str) -> Path:
-        return self.meshes / name / "meshes" / "model.obj"
-
-    def loader(self, name: str) -> Callable[[], trimesh.Scene]:
-        return partial(load_gso, self.file(name))
-
-
-@register("data", "oo3d")
-class OO3DData(ScannedData):
-    """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
-
-    release = "oo3d"
-
-    def available(self) -> list[str]:
-        """Names of the objects with a scan: those of their folders, such as "dinosaur_002"."""
-        if not self.meshes.is_dir():
-            raise UserError(f"{self.meshes}: there is no such folder; give data.path=FOLDER, OmniObject3D's raw_scans")
-        names = sorted(file.parts[-3] for file in self.meshes.glob("*/*/Scan/Scan.obj"))
-        names = [name for name in names if self.file(name).is_file()]
-        if not names:
-            raise UserError(f"{self.meshes}: holds no scan of OmniObject3D; looked for {self.file('CATEGORY_001')}")
-        return names
-
-    def file(self, name: str) -> Path:
-        return self.meshes / name.rpartition("_")[0] / name / "Scan" / "Scan.obj"
-
-    def loader(self, name: str) -> Callable[[], trimesh.Scene]:
-        return partial(load_scene, self.file(name))  # has +Y up
 
 
 class _GSOFiles(FilePathResolver):
@@ -179,12 +131,29 @@ def load_gso(path: Path) -> trimesh.Scene:
     for file in (path, texture):
         if not file.is_file():
             raise UserError(f"{file}: there is no such file; an object of GSO needs it")
-    try:
-        with path.open("rb") as opened:
-            scene = trimesh.load_scene(opened, file_type="obj", resolver=_GSOFiles(path, texture))
+    with loading(path), path.open("rb") as opened:
+        scene = trimesh.load_scene(opened, file_type="obj", resolver=_GSOFiles(path, texture))
         scene.apply_transform(_Z_UP_TO_Y_UP)
         return normalise(scene)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    except Exception as error:  # the parsers of trimesh raise anything from KeyError to struct.error
-        raise UserError(f"{path}: does not load as a mesh ({type(error).__name__}: {error})") from error
+
+
+@register("data", "gso")
+class GSOData(ScannedData):
+    """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
+
+    release, what, meshes_of_release = "gso", "objects of GSO", "*/meshes/model.obj"
+    load = staticmethod(load_gso)
+
+    def file(self, name: str) -> Path:
+        return self.meshes / name / "meshes" / "model.obj"
+
+
+@register("data", "oo3d")
+class OO3DData(ScannedData):
+    """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
+
+    release, what, meshes_of_release = "oo3d", "scans of OmniObject3D", "*/*/Scan/Scan.obj"
+    load = staticmethod(load_scene)  # has +Y up
+
+    def file(self, name: str) -> Path:
+        return self.meshes / name.rpartition("_")[0] / name / "Scan" / "Scan.obj"
