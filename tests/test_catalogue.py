@@ -13,11 +13,11 @@ from omegaconf import OmegaConf
 
 import lp_framework
 from lp_framework import catalogue, registry
+from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 CONF = ROOT / "conf"
-LOADER = CONF / "loader" / "pairs.yaml"  # shared by all data sets
 REGISTERED = re.compile(r'^@register\("(\w+)", "(\w+)"\)$', re.MULTILINE)
 # From the sources: neither the registry nor the catalogue is asked what it holds.
 BUILT_INS = sorted(
@@ -35,9 +35,14 @@ COMMENTED = [file for file in EVERY_FILE if file.relative_to(CONF).parts[0] not 
 
 def settings(group: str, name: str) -> dict[str, Any]:
     """The settings of a built-in with their defaults, in the order in which its YAML has them."""
-    parameters = inspect.signature(registry.get(group, name)).parameters
-    own = {key: in_yaml(each.default) for key, each in parameters.items() if key not in registry.GROUPS}
-    return {key: own[key] for key in stated(LOADER)} | own if group == "data" else own
+    own = arguments(registry.get(group, name))
+    return arguments(PairDataModule) | own if group == "data" else own
+
+
+def arguments(cls: type) -> dict[str, Any]:
+    """The settings of a constructor with their defaults; what is built for it is left out."""
+    parameters = inspect.signature(cls).parameters
+    return {key: in_yaml(each.default) for key, each in parameters.items() if key not in (*registry.GROUPS, "source")}
 
 
 def in_yaml(default: Any) -> Any:
