@@ -170,7 +170,7 @@ def test_whole_objects_can_be_held_out_for_validation(make, root):
     assert make(validation_objects=2, validation_views=12).table("validation").counts == [12] * 2
     with pytest.raises(UserError, match=r"data\.validation_objects=4 of 4 objects leave none to train on"):
         make(validation_objects=4).table("train")
-    with pytest.raises(UserError, match=r"validation_views must be at least 2.* with data\.validation_objects=1"):
+    with pytest.raises(UserError, match=r"data\.validation_objects must be 0 where data\.validation_views is 0, got 1"):
         make(validation_objects=1, validation_views=0)
 
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from lp_framework.data.meshes import MeshObject
 from lp_framework.data.toy import shapes, toy_objects
-from lp_framework.data.toy.lotus_vase import REPEATS
+from lp_framework.data.toy.continuous import REPEATS
 
 TOYS = {toy.name: toy for toy in toy_objects()}
 SPACING = 0.012  # between neighbouring points of a cloud, in units of the object's longest side

@@ -34,7 +34,7 @@ from lp_framework.data.pairs import (
 )
 from lp_framework.data.source import ViewSource
 from lp_framework.data.views import ObjectViews
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import stable_id
 
 EVALUATION_PAIRS = 224  # pairs a batch, by default; four objects of eight test views
@@ -75,17 +75,17 @@ class PairDataModule(LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        for name, value, least in (
-            ("image_size", image_size, 8), ("batch_pairs", batch_pairs, 1), ("block", block, 1),
-            ("validation_objects", validation_objects, 0),
-        ):  # fmt: skip
-            if value < least:
-                raise UserError(f"data.{name} must be at least {least}, got {value}")
-        if validation_views == 1 or validation_views < 0 or (validation_objects and not validation_views):
-            raise UserError(
-                "data.validation_views must be at least 2, a pair needs two views, or 0 for no validation; got "
-                f"{validation_views} with data.validation_objects={validation_objects}"
-            )
+        wanted = "at least 2, for a pair needs two views, or 0 for no validation"
+        check_settings(
+            "data",
+            ("image_size", image_size, image_size >= 8, "at least 8"),
+            ("batch_pairs", batch_pairs, batch_pairs >= 1, "at least 1"),
+            ("block", block, block >= 1, "at least 1"),
+            ("validation_views", validation_views, validation_views == 0 or validation_views >= 2, wanted),
+            ("validation_objects", validation_objects, validation_objects >= 0, "at least 0"),
+            ("validation_objects", validation_objects, validation_views > 0 or validation_objects == 0,
+             "0 where data.validation_views is 0"),
+        )  # fmt: skip
         self.source, self.cache = source, Path(cache)
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed

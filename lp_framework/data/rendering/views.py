@@ -36,7 +36,7 @@ from lp_framework.data.object_folders import (
 )
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import camera_to_world
 
 RECORD = "render.json"
@@ -70,31 +70,19 @@ class ViewProtocol:
 
     def __post_init__(self) -> None:
         low, high = self.lowest_latitude_degrees, self.highest_latitude_degrees
-        steps = self.latitude_step_degrees, self.longitude_step_degrees
-        radii = self.nearest_radius, self.farthest_radius
-        for fits, wanted in (
-            (self.resolution >= 1, f"resolution must be at least 1, not {self.resolution}"),
-            (
-                0 < self.field_of_view_degrees < 180,
-                f"field_of_view_degrees must lie between 0 and 180, not {self.field_of_view_degrees}",
-            ),
-            (
-                -90 <= low <= high <= 90,
-                f"the latitudes must satisfy -90 <= lowest <= highest <= 90 degrees, not {low} and {high}",
-            ),
-            (min(steps) > 0, f"the steps must be positive, not {steps[0]} and {steps[1]}"),
-            (
-                0 < radii[0] <= radii[1],
-                f"the radii must satisfy 0 < nearest <= farthest, not {radii[0]} and {radii[1]}",
-            ),
-            (self.test_views >= 0, f"test_views must not be negative, not {self.test_views}"),
-            (
-                self.train_views is None or self.train_views >= 1,
-                f"train_views must be at least 1, or null for the grid, not {self.train_views}",
-            ),
-        ):
-            if not fits:
-                raise UserError(f"view protocol: {wanted}")
+        near, far, angle = self.nearest_radius, self.farthest_radius, self.field_of_view_degrees
+        steps = {key: getattr(self, key) for key in ("latitude_step_degrees", "longitude_step_degrees")}
+        few = self.train_views
+        check_settings(
+            "data",
+            ("resolution", self.resolution, self.resolution >= 1, "at least 1"),
+            ("test_views", self.test_views, self.test_views >= 0, "at least 0"),
+            ("train_views", few, few is None or few >= 1, "at least 1, or null for the grid"),
+            *((key, step, step > 0, "positive") for key, step in steps.items()),
+            ("field_of_view_degrees", angle, 0 < angle < 180, "between 0 and 180"),
+            ("lowest_latitude_degrees", low, -90 <= low <= high <= 90, f"from -90 to the highest, {high}"),
+            ("nearest_radius", near, 0 < near <= far, f"from 0 to the farthest, {far}"),
+        )
 
     def training_poses(self, object_name: str) -> NDArray[np.float64]:
         """View poses `[V, 3]` (radians, radians, scene units), on the grid latitude by latitude.

@@ -46,7 +46,7 @@ from lp_framework.data.real_cameras import (
 )
 from lp_framework.data.sets.object_lists import LIST
 from lp_framework.data.source import ViewSource
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import to_ifusion, view_pose
 from lp_framework.keyed_random import stable_id
 
@@ -140,10 +140,12 @@ class PhotographedData(ConvertedSource):
     def __init__(
         self, path: str, views: str, train_views: int, test_views: int, resolution: int, split_seed: int
     ) -> None:
-        counts = (("train_views", train_views, 2), ("test_views", test_views, 2), ("resolution", resolution, 16))
-        for name, value, least in counts:
-            if value < least:
-                raise UserError(f"data.{name} must be at least {least}, got {value}")
+        check_settings(
+            "data",
+            ("train_views", train_views, train_views >= 2, "at least 2"),
+            ("test_views", test_views, test_views >= 2, "at least 2"),
+            ("resolution", resolution, resolution >= 16, "at least 16"),
+        )
         self.download, self.path = Path(path), Path(views)
         self.train_views, self.test_views = train_views, test_views
         self.resolution, self.split_seed = resolution, split_seed

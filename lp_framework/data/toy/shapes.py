@@ -3,7 +3,10 @@ coordinates. +Y is up; a texture's left edge lies at the back (-Z) of a lathe, s
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import trimesh
@@ -13,6 +16,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from lp_framework.data.meshes import normalise
+from lp_framework.data.toy.textures import Colour, plain
 
 Array = NDArray[np.float64]
 
@@ -48,14 +52,15 @@ class Shape:
             np.concatenate([self.triangles, other.triangles + len(self.vertices)]),
         )
 
-    def paint(self, texture: Image.Image) -> trimesh.Trimesh:
-        """The finished mesh, in a matt material."""
+    def paint(self, texture: Image.Image | Colour) -> trimesh.Trimesh:
+        """The finished mesh, in a matt material of one colour or with a texture."""
+        texture = plain(texture) if isinstance(texture, tuple) else texture
         material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0)
         visual = TextureVisuals(uv=self.uv, material=material)
         return trimesh.Trimesh(self.vertices, self.triangles, visual=visual, process=False)
 
 
-def scene(parts: list[trimesh.Trimesh]) -> trimesh.Scene:
+def scene(*parts: trimesh.Trimesh) -> trimesh.Scene:
     """The normalised scene of the parts."""
     return normalise(trimesh.Scene(parts))
 
@@ -210,12 +215,9 @@ def box(x: float, y: float, z: float, radius: float = 0.03, steps: int = 3) -> S
     return joined(shapes)
 
 
-def joined(shapes: list[Shape]) -> Shape:
+def joined(shapes: Iterable[Shape]) -> Shape:
     """Several shapes as one, to be painted with one texture."""
-    total = shapes[0]
-    for shape in shapes[1:]:
-        total += shape
-    return total
+    return reduce(operator.add, shapes)
 
 
 def extrude(outline: ArrayLike, depth: float, bevel: float = 0.02) -> Shape:

@@ -47,6 +47,16 @@ def pen(image: Image.Image) -> ImageDraw.ImageDraw:
     return ImageDraw.Draw(image)
 
 
+def canvas(
+    width: int, height: int, colour: Colour, strength: float = 0.0, seed: int = 0, cells: int = 12
+) -> tuple[Image.Image, ImageDraw.ImageDraw]:
+    """A ground of one colour, uneven as `mottle` makes it if it has a `strength`, and a pen to draw on it."""
+    image = Image.new("RGB", (width, height), colour)
+    if strength:
+        image = mottle(image, strength, seed, cells)
+    return image, pen(image)
+
+
 def noise(width: int, height: int, columns: int, rows: int, seed: int) -> NDArray[np.float64]:
     """Smooth noise `[height, width]` in about [-1, 1] from a grid of random values; its left and right edges meet."""
     grid = np.random.default_rng(seed).uniform(-1, 1, (rows, columns)).astype(np.float32)
