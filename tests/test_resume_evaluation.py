@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import time
+import zlib
 from pathlib import Path
 
 import pytest
@@ -195,6 +196,25 @@ def test_results_do_not_outlive_the_beginning_of_others(commands, whole, stop):
 # ---------------------------------------------------------------- what does not go together
 
 
+def test_an_unfinished_evaluation_of_an_earlier_version_is_refused_in_a_sentence(commands, stop):
+    folder = stop("earlier", 2)
+    rows = [json.loads(line[9:]) for line in journal(folder).read_bytes().splitlines()]
+    for row in rows:
+        row["pair"] = [100 * reference + query for reference, query in row["pair"]]  # as it was written then
+    texts = [json.dumps(row).encode() for row in rows]
+    journal(folder).write_bytes(b"".join(b"%08x %s\n" % (zlib.crc32(text), text) for text in texts))
+    subject = json.loads((folder / "unfinished" / "evaluation.json").read_text())
+    del subject["config"]["data"]["validation_objects"]  # a setting that came later
+    (folder / "unfinished" / "evaluation.json").write_text(json.dumps(subject))
+    for ran in (commands.here("earlier", "eval", *EVALUATION), commands.here("unused", "eval", "resume=earlier")):
+        assert ran.error.endswith("rank_0.jsonl: is of an earlier version of lp_framework; remove earlier/unfinished")
+    del subject["config"]["batch_pairs"]
+    (folder / "unfinished" / "evaluation.json").write_text(json.dumps(subject))
+    assert commands.here("unused", "eval", "resume=earlier").error == (
+        "resume=earlier: is of another version of lp_framework, without batch_pairs; evaluate anew"
+    )
+
+
 def test_another_configuration_is_refused_in_a_sentence_and_nothing_is_lost(commands, stop):
     folder = stop("mixed", 2)
     before = journal(folder).read_bytes()
@@ -289,10 +309,9 @@ def solved(pairs: int = 4, starts: int = 3) -> SolvedBatch:
         torch.randn(pairs, starts, dtype=torch.float64, generator=generator).exp() for _ in range(2)
     )
     rotation[0, 0], translation[0, 0], translation[0, 1] = torch.nan, torch.inf, 5e-324
-    numbers = torch.arange(pairs)
-    return SolvedBatch(
-        numbers, numbers % 2, rotation, translation, numbers % starts, torch.rand(pairs, 3).double() / 3, 0.1, 12
-    )
+    numbers, answer = torch.arange(pairs), torch.rand(pairs, 3).double() / 3
+    pair = torch.stack([numbers, numbers + 1], dim=1)
+    return SolvedBatch(pair, numbers % 2, rotation, translation, numbers % starts, answer, 0.1, 12)
 
 
 def test_a_journal_gives_back_every_bit(tmp_path):

@@ -61,6 +61,8 @@ def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[
     if subject is None:
         raise UserError(f"resume={folder}: holds no {FOLDER} evaluation to go on from; give the folder of one")
     previous = OmegaConf.create(subject["config"])
+    if missing := sorted({*config} - {*previous}):
+        raise UserError(f"resume={folder}: is of another version of lp_framework, without {missing[0]}; evaluate anew")
     checkpoint = subject["checkpoint"]
     saved = folder / FOLDER
     return with_overrides(previous, config, overrides, MOVABLE, saved), None if checkpoint is None else Path(checkpoint)

@@ -82,7 +82,10 @@ class Journal:
             for number, line in enumerate(file.read_bytes().split(b"\n")):
                 checksum, _, text = line.partition(b" ")
                 if checksum == b"%08x" % zlib.crc32(text):
-                    yield _solved(json.loads(text))
+                    solved = _solved(json.loads(text))
+                    if solved.pair.ndim != 2:
+                        raise UserError(f"{file}: is of an earlier version of lp_framework; remove {self.folder}")
+                    yield solved
                 elif line:
                     log.info("%s: line %d is cut short or damaged, its pairs are solved again", file, number + 1)
 
@@ -145,13 +148,17 @@ def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The keys whose values differ, with both values; a key that is missing on a side counts as None there.
+    """The keys whose values differ, with both values; a setting that a side does not know is off there, as None is.
 
-    >>> differences({"gamma": 0, "steps": 5}, {"gamma": 0.3, "steps": 5})
+    >>> differences({"gamma": 0, "steps": 5}, {"gamma": 0.3, "steps": 5, "depth": False})
     {'gamma': (0, 0.3)}
     """
-    keys = sorted({*ours, *theirs})
-    return {key: (ours.get(key), theirs.get(key)) for key in keys if ours.get(key) != theirs.get(key)}
+    both = {key: (ours.get(key), theirs.get(key)) for key in sorted({*ours, *theirs})}
+    return {
+        key: (our, their)
+        for key, (our, their) in both.items()
+        if our != their and ((key in ours and key in theirs) or our or their)
+    }
 
 
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
