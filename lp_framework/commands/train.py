@@ -48,7 +48,7 @@ from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.training import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
-OF_TRAINING = ("batch_pairs", "block", "validation_views", "seed")  # settings of data that an evaluation has no use for
+OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, without use in eval
 # Of Lightning's entries in a checkpoint, those without which no training goes on.
 TRAINING_STATE = {"epoch": int, "global_step": int, "loops": dict, "optimizer_states": list, "lr_schedulers": list}
 
