@@ -108,11 +108,7 @@ class ViewTable:
                 others = [random.choice(views[views != query]) for query in views]
                 chosen.append(np.stack([np.array(others), views], axis=1))
                 continue
-            if protocol == "ifusion":
-                views = views[:5]
-            reference, query = np.meshgrid(views, views, indexing="ij")
-            pairs = np.stack([reference.ravel(), query.ravel()], axis=1)
-            chosen.append(pairs[pairs[:, 0] != pairs[:, 1]])
+            chosen.append(_within(views[:5] if protocol == "ifusion" else views))
         return np.concatenate(chosen)
 
     def view_sets(self, views: int) -> NDArray[np.int64]:
@@ -251,8 +247,8 @@ def _across(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _within(views: NDArray[np.int64]) -> NDArray[np.int64]:
-    first, second = (grid.ravel() for grid in np.meshgrid(views, views, indexing="ij"))
-    return np.stack([first, second], axis=1)[first != second]
+    pairs = np.stack(np.meshgrid(views, views, indexing="ij"), axis=-1).reshape(-1, 2)
+    return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
 def in_batches(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:

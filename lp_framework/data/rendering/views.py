@@ -16,7 +16,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -131,7 +130,14 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
     scene = obj.load()
     mesh, settings = fingerprint(scene), asdict(protocol)
     if folder.exists():
-        _check_record(folder, protocol, mesh)
+        changes = _changes(folder, protocol, mesh=mesh)
+        if changes is None:
+            raise UserError(
+                f"{folder} exists and was not rendered by this program (it has no proper {RECORD}); "
+                "choose another folder or delete it"
+            )
+        if changes:
+            raise UserError(f"{folder} was rendered differently ({changes}); choose another folder or delete this one")
         return False
     labels = {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer}
     record = {
@@ -166,35 +172,16 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
     return True
 
 
-def _recorded(folder: Path, protocol: ViewProtocol) -> tuple[dict[str, Any], dict[str, Any]] | None:
-    """What an object was rendered from by its record, and what the protocol asks of it; None without a proper record.
+def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str | None:
+    """What the record of an object's views says otherwise than wanted (see `differences`), None without a proper one.
 
-    Depths that are there do no harm where they are not asked for.
+    Labels may differ, they are not rendered; depths that are there do no harm where they are not asked for.
     """
     record = read_record(folder / RECORD)
     if not isinstance(record.get("protocol"), dict):
         return None
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
-    return {**LATER, **record["protocol"], "mesh": record.get("mesh")}, wanted
-
-
-def _is_rendered(obj: MeshObject, root: str | Path, protocol: ViewProtocol) -> bool:
-    """Whether `<root>/<name>` holds the object's views, by its record; the mesh is not looked at."""
-    recorded = _recorded(Path(root) / obj.name, protocol)
-    return recorded is not None and not differences(*recorded)
-
-
-def _check_record(folder: Path, protocol: ViewProtocol, mesh: str) -> None:
-    """`UserError` unless the folder was rendered from the same mesh under the same protocol; labels may differ, they
-    are not rendered."""
-    recorded = _recorded(folder, protocol)
-    if recorded is None:
-        raise UserError(
-            f"{folder} exists and was not rendered by this program (it has no proper {RECORD}); "
-            "choose another folder or delete it"
-        )
-    if changed := differences(recorded[0], {**recorded[1], "mesh": mesh}):
-        raise UserError(f"{folder} was rendered differently ({changed}); choose another folder or delete this one")
+    return differences({**LATER, **record["protocol"], "mesh": record.get("mesh")}, {**wanted, **mesh})
 
 
 # ---------------------------------------------------------------- many objects
@@ -220,7 +207,7 @@ def render_objects(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"several objects have the same name: {', '.join(twice)}")
     if not check_meshes:
-        todo = [obj for obj in todo if not _is_rendered(obj, root, protocol)]
+        todo = [obj for obj in todo if _changes(Path(root) / obj.name, protocol) != ""]
     if not todo:
         return
     if workers is None:

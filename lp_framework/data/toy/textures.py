@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from itertools import chain, product
+
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -107,39 +110,35 @@ def planks(colour: Colour, width: int = 512, height: int = 512, rows: int = 6, s
     return image
 
 
+def courses(width: int, height: int, rows: Sequence[int], of: int, proportion: float) -> Iterator[tuple[float, ...]]:
+    """Places of bricks or tiles in running bond: left, top, length and height of each in some of `of` rows."""
+    high = height / of
+    columns = max(2, round(width / (proportion * high)))
+    long = width / columns
+    for row in rows:
+        for column in range(-1, columns + 1):
+            yield (column + 0.5 * (row % 2)) * long, row * high, long, high
+
+
 def bricks(
     colour: Colour, mortar: Colour, width: int = 512, height: int = 512, rows: int = 12, seed: int = 0
 ) -> Image.Image:
     """A wall in running bond, every brick of its own tone."""
-    image = Image.new("RGB", (width, height), mortar)
-    draw = pen(image)
+    image, draw = canvas(width, height, mortar)
     random = np.random.default_rng(seed)
-    high = height / rows
-    columns = max(2, round(width / (2.2 * high)))
-    long = width / columns
-    for row in range(rows):
-        for column in range(-1, columns + 1):
-            x, y = (column + 0.5 * (row % 2)) * long, row * high
-            fill = shade(colour, 1 + random.uniform(-0.22, 0.14))
-            draw.rounded_rectangle([x + 2, y + 2, x + long - 2, y + high - 2], radius=3, fill=fill)
+    for x, y, long, high in courses(width, height, range(rows), rows, 2.2):
+        fill = shade(colour, 1 + random.uniform(-0.22, 0.14))
+        draw.rounded_rectangle([x + 2, y + 2, x + long - 2, y + high - 2], radius=3, fill=fill)
     return mottle(image, 0.08, seed)
 
 
 def shingles(colour: Colour, width: int = 512, height: int = 512, rows: int = 10, seed: int = 0) -> Image.Image:
     """Round roof tiles, overlapping downwards."""
-    image = Image.new("RGB", (width, height), shade(colour, 0.55))
-    draw = pen(image)
+    image, draw = canvas(width, height, shade(colour, 0.55))
     random = np.random.default_rng(seed)
-    high = height / rows
-    columns = max(2, round(width / (1.1 * high)))
-    long = width / columns
-    for row in range(rows, -2, -1):
-        for column in range(-1, columns + 1):
-            x, y = (column + 0.5 * (row % 2)) * long, row * high
-            fill = shade(colour, 1 + random.uniform(-0.18, 0.14))
-            edge = shade(colour, 0.5)
-            area = [x + 1, y - high, x + long - 1, y + 1.25 * high]
-            draw.rounded_rectangle(area, radius=0.48 * long, fill=fill, outline=edge, width=3)
+    for x, y, long, high in courses(width, height, range(rows, -2, -1), rows, 1.1):
+        fill, area = shade(colour, 1 + random.uniform(-0.18, 0.14)), [x + 1, y - high, x + long - 1, y + 1.25 * high]
+        draw.rounded_rectangle(area, radius=0.48 * long, fill=fill, outline=shade(colour, 0.5), width=3)
     return image
 
 
@@ -151,14 +150,13 @@ def dot(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: Co
 def rivets(image: Image.Image, margin: float, step: float, radius: float, colour: Colour) -> None:
     """Rivet heads along the four edges of the image."""
     width, height = image.size
-    draw = pen(image)
     across = np.linspace(margin, width - margin, max(2, round(width / step)))
     down = np.linspace(margin, height - margin, max(2, round(height / step)))
-    for x, y in [(x, y) for x in across for y in (margin, height - margin)] + [
-        (x, y) for y in down for x in (margin, width - margin)
-    ]:
-        dot(draw, x + radius / 3, y + radius / 3, radius, shade(colour, 0.45))
-        dot(draw, x, y, radius, colour)
+    for x, y in chain(
+        product(across, (margin, height - margin)), ((x, y) for y in down for x in (margin, width - margin))
+    ):
+        dot(pen(image), x + radius / 3, y + radius / 3, radius, shade(colour, 0.45))
+        dot(pen(image), x, y, radius, colour)
 
 
 def text(
@@ -196,15 +194,8 @@ def window(
     inner = (left + rim, top + rim, right - rim, bottom - rim)
     draw.rectangle(inner, fill=GLASS)
     wide, high = inner[2] - inner[0], inner[3] - inner[1]
-    draw.polygon(
-        [
-            (inner[0] + 0.15 * wide, inner[3]),
-            (inner[0] + 0.6 * wide, inner[1]),
-            (inner[0] + 0.85 * wide, inner[1]),
-            (inner[0] + 0.4 * wide, inner[3]),
-        ],
-        fill=shade(GLASS, 1.25),
-    )
+    corners = ((0.15, 3), (0.6, 1), (0.85, 1), (0.4, 3))
+    draw.polygon([(inner[0] + share * wide, inner[side]) for share, side in corners], fill=shade(GLASS, 1.25))
     for k in range(1, bars + 1):
         x = inner[0] + wide * k / (bars + 1)
         draw.rectangle([x - rim / 3, inner[1], x + rim / 3, inner[3]], fill=frame)
