@@ -111,6 +111,15 @@ def test_the_division_depends_on_the_seed_alone(make, root, tmp_path):
     assert [file for file in held_out(0) if "/cup/" in file] == before
 
 
+def test_objects_hold_out_views_of_their_own(make, root):
+    for name in ("brush", "cart", "drum"):
+        write_object(root, name, train=12, test=4)
+    places: dict[str, list[str]] = {}
+    for file in make().table("validation").files:
+        places.setdefault(file.parts[-4], []).append(file.name)
+    assert len(places) == 6 and len({tuple(each) for each in places.values()}) > 3
+
+
 def test_test_views_are_never_divided(make, root):
     for validation_views in (0, 2, 4):
         table = make(validation_views=validation_views).table("test")

@@ -151,7 +151,7 @@ class PairDataModule(LightningDataModule):
                 f"object '{views.name}' has {len(views)} training views; holding out data.validation_views={count} "
                 f"needs at least {count + left}"
             )
-        order = np.random.default_rng([self.seed, len(views)]).permutation(len(views))
+        order = np.random.default_rng([self.seed, stable_id(views.name)]).permutation(len(views))
         kept = np.sort(order[:count] if held_out else order[count:])
         files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
         return replace(views, files=files, cameras=cameras)
