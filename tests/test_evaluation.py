@@ -221,7 +221,7 @@ def test_errors_compare_the_querys_predicted_camera_with_its_true_one():
     batch = PairBatch(
         pixels=None, features=None, names=["a/0", "a/1"], poses=poses, cameras=camera_to_world(poses),
         objects=torch.zeros(2).long(), reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]),
-        pairs=torch.tensor([[0, 1], [1, 0]]), numbers=torch.tensor([1, 2]),
+        pairs=torch.tensor([[0, 1], [1, 0]]),
     )  # fmt: skip
     true = batch.relative_poses()[:, None].double()
     turned = true + torch.tensor([0.0, math.radians(10), 0.0], dtype=torch.float64)
@@ -241,7 +241,7 @@ def test_full_cameras_are_judged_at_the_scale_that_suits_each_best():
     batch = PairBatch(
         pixels=None, features=None, names=["a/0", "a/1"], poses=poses, cameras=camera_to_world(poses),
         objects=torch.zeros(2).long(), reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]),
-        pairs=torch.tensor([[0, 1], [1, 0]]), numbers=torch.tensor([1, 2]),
+        pairs=torch.tensor([[0, 1], [1, 0]]),
     )  # fmt: skip
     true = relative_camera(batch.cameras, batch.cameras.flip(0))[:, None]
     half = rigid_transform(true[..., :3, :3], true[..., :3, 3] / 2)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
 from urllib.error import URLError
 
 import pytest
@@ -11,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from lp_framework import registry, torchvision_ops
-from lp_framework.data.pairs import PairBatch
+from lp_framework.data.pairs import PairBatch, PairData, ViewTable
+from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world
 from lp_framework.models.backbones import Backbone, EfficientNetLite0, ResNet, Standardise, freeze
@@ -50,7 +53,6 @@ def batch(views: int = 4, seed: int = 0) -> PairBatch:
         names=[f"cup/{view}" for view in range(views)], poses=poses,
         cameras=camera_to_world(poses), objects=torch.zeros(views, dtype=torch.long),
         reference=reference, query=query, pairs=torch.stack([reference, query], dim=1),
-        numbers=reference * views + query,
     )  # fmt: skip
 
 
@@ -204,6 +206,25 @@ def test_cached_features_give_the_loss_of_the_images():
     by_image = model.training_step(pairs, 0)
     pairs.features, pairs.pixels = model.backbone.trunk(pairs.images), None
     torch.testing.assert_close(model.training_step(pairs, 0), by_image)
+
+
+def test_validation_noise_is_the_pairs_own_whatever_else_the_data_hold():
+    def views_of(name: str) -> ObjectViews:
+        poses = torch.rand(3, 3, generator=torch.Generator().manual_seed(len(name)), dtype=torch.float64) + 1
+        files = [Path(f"{name}/train/rgb/{index:03d}.png") for index in range(3)]
+        return ObjectViews(name, "train", "unlabelled", None, files, camera_to_world(poses), 0.8)
+
+    def losses(names: Sequence[str]) -> list[float]:
+        """Of the pairs of the last object."""
+        table = ViewTable([views_of(name) for name in names])
+        images = torch.arange(3 * 8 * 8 * 3).view(3, 8, 8, 3).repeat(len(names), 1, 1, 1) % 256
+        validated = PairData(table, images.to(torch.uint8).numpy(), None)[table.pairs()[-6:]]
+        model.validation_loss.reset()
+        model.validation_step(validated, 0)
+        return torch.cat(model.validation_loss.value).tolist()
+
+    model = ScoreModel(Colors()).eval()
+    assert losses(["mug"]) == losses(["brush", "mug"])
 
 
 def test_images_of_another_size_are_resized():

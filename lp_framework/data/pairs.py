@@ -25,9 +25,9 @@ class PairBatch:
 
     `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, ...]` that a frozen backbone computed from them; `names` of the
     views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`;
-    `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table, `numbers` `[P]` a
-    number for each ordered pair of rows. Where they are asked for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]`
-    (float32) along the optical axis in scene units, 0 where there is nothing.
+    `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table. Where they are asked
+    for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]` (float32) along the optical axis in scene units, 0 where
+    there is nothing.
     """
 
     pixels: Tensor | None
@@ -39,7 +39,6 @@ class PairBatch:
     reference: Tensor
     query: Tensor
     pairs: Tensor
-    numbers: Tensor
     alpha: Tensor | None = None
     depth: Tensor | None = None
 
@@ -173,7 +172,6 @@ class PairData(Dataset[PairBatch]):
             reference=torch.from_numpy(place[:, 0]),
             query=torch.from_numpy(place[:, 1]),
             pairs=torch.from_numpy(pairs),
-            numbers=torch.from_numpy(pairs[:, 0] * len(self.table) + pairs[:, 1]),
             alpha=rows(self.alpha),
             depth=rows(self.depth),
         )

@@ -34,7 +34,7 @@ class PairMean(Metric):
         self.add_state("value", [], dist_reduce_fx="cat")
 
     def update(self, pair: Tensor, value: Tensor) -> None:
-        """Add values `[P]` (float64 inside) of the pairs numbered `[P]`."""
+        """Add values `[P]` (float64 inside) of pairs with these ids `[P]`."""
         self.pair.append(pair)
         self.value.append(value.double())
 

@@ -116,12 +116,12 @@ class PoseModel(TrainedModule):
         return loss
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
-        features = self._features(batch)
+        features, ids = self._features(batch), batch.ids
         true = batch.relative_poses()[:, None].expand(-1, VALIDATION_NOISES, -1)
-        noised = self._validation_noise(true, batch.numbers)
+        noised = self._validation_noise(true, ids)
         condition = self.condition(features[batch.reference], features[batch.query])[:, None]
         loss = self.pair_loss(condition, noised, true).mean(dim=1)
-        self.validation_loss.update(batch.numbers, loss)
+        self.validation_loss.update(ids, loss)
         self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
 
     def _features(self, batch: PairBatch) -> Tensor:

@@ -123,11 +123,11 @@ class PriorModel(TrainedModule):
         return loss + self.view_loss * view_loss + image_loss
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
-        latents = self.networks.latents(self._pixels(batch))
-        timestep = keyed_bits(self.seed, batch.numbers, count=1).squeeze(-1) % len(self.alphas_cumprod)
-        noise = keyed_normal(self.seed, batch.numbers, count=latents.shape[1]).to(latents)
+        latents, ids = self.networks.latents(self._pixels(batch)), batch.ids
+        timestep = keyed_bits(self.seed, ids, count=1).squeeze(-1) % len(self.alphas_cumprod)
+        noise = keyed_normal(self.seed, ids, count=latents.shape[1]).to(latents)
         error, _ = self._denoise(batch, self.networks.encoder(self._features(batch)), latents, timestep, noise)
-        self.validation_loss.update(batch.numbers, error)
+        self.validation_loss.update(ids, error)
         self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
 
     def _features(self, batch: PairBatch) -> Tensor:
