@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import importlib.util
 import json
 import re
@@ -21,6 +23,7 @@ from PIL import Image
 
 from lp_framework.analysis import examples as examples_module
 from lp_framework.analysis.examples import (
+    EXAMPLES,
     FILE,
     MOST,
     gather_examples,
@@ -35,15 +38,16 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.geometry import camera_to_world, wrap_angle
 from lp_framework.models.pose_model import FieldValue
+from lp_framework.report import page as page_module
+from lp_framework.report import pairs as pairs_module
+from lp_framework.report.page import write_report_page, write_run_page
 from lp_framework.report.runs import run_folders, run_kind
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 from lp_framework.viz import style
-from lp_framework.viz.html import run_page, viewer
-from lp_framework.viz.html.run_page import write_report_page, write_run_page
 
 LARGEST = 10_000_000  # bytes
-VOID = {"meta", "link", "img", "input", "br"}
+VOID = {"meta", "link", "img", "input", "wbr"}
 DEEP, DEEP_YAML = "[" * 100_000, "a: " + "[" * 3000  # deeper than their readers go
 
 
@@ -57,13 +61,16 @@ class Page(HTMLParser):
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.words: list[str] = []
         self.headings: list[str] = []
-        self.data: Any = None
+        self.figures: dict[str, list[Any]] = {}  # by kind
         self.feed(self.text)
         self.close()
         assert self.open == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, dict(attrs)))
+        if packed := dict(attrs).get("data-figure"):
+            kind = str(dict(attrs)["class"]).removeprefix("plot ")
+            self.figures.setdefault(kind, []).append(json.loads(gzip.decompress(base64.b64decode(packed))))
         if tag not in VOID:
             self.open.append(tag)
 
@@ -71,10 +78,7 @@ class Page(HTMLParser):
         assert self.open and self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] == "script":
-            if self.elements[-1][1].get("id") == "data":
-                self.data = json.loads(data)
-        elif self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("script", "style"):
             self.words.append(data)
             if self.open[-1] == "h2":
                 self.headings.append(data)
@@ -279,25 +283,64 @@ def test_names_cannot_break_out(tmp_path):
     assert not any(tag == "img" and not attributes["src"].startswith("data:") for tag, attributes in page.elements)
     shown = NASTY.replace("_", " ")
     assert page.said.count(shown) >= 3  # a card, a row an object, rows of the worst pairs
-    examples = next(each for each in page.data if isinstance(each, dict))["examples"]
-    assert [each["object"] for each in examples] == [NASTY, "vase", "red_mug"]  # failures first
+    assert cards(page) == [shown, "vase", "red mug"]  # failures first
+
+
+def cards(page: Page) -> list[str]:
+    """The objects of the pairs on a page."""
+    alts = [str(attributes["alt"]) for tag, attributes in page.elements if tag == "img"]
+    return [alt.removeprefix("query of ").rpartition(":")[0] for alt in alts if alt.startswith("query of ")]
 
 
 def test_the_data_of_a_page_are_those_of_the_run(tmp_path):
     page = page_of(write_evaluation(tmp_path / "run"))
-    content = next(each for each in page.data if isinstance(each, dict))["examples"][-1]
     expected = example()
-    np.testing.assert_allclose(content["trajectories"], expected.trajectories, rtol=1e-5, atol=1e-9)
-    assert content["energies"][3] is None
+    energy = expected.landscapes["energy of the prior"].energy.numpy()
+    contours = [trace for trace in page.figures["map"][-1]["data"] if trace["type"] == "contour"]
+    assert [trace["meta"] for trace in contours] == list(expected.landscapes)
+    assert [trace["visible"] for trace in contours] == [True, False]
+    np.testing.assert_allclose(np.array(contours[0]["z"])[:, :-1], energy, atol=1e-5)
     minima = expected.landscapes["energy of the prior"].minima()
-    assert len(minima) == 2
-    np.testing.assert_allclose(
-        content["landscapes"][0]["minima"], [[each.latitude, each.longitude] for each in minima], atol=1e-3
-    )
-    curves = next(each for each in page.data if isinstance(each, list))
-    assert [curve["name"] for curve in curves] == ["unique", "twofold", "continuous"]
-    assert curves[0]["share"][-1] == 0.75  # one of four pairs has no answer
+    assert len(minima) == 2 and "energy of the prior 2 valleys, the deepest first: " in page.said.replace("\n", " ")
+    curves = [trace for trace in page.figures["errors"][0]["data"] if trace["mode"] == "lines"]
+    assert [curve["name"] for curve in curves] == [f"{kind} (4 pairs)" for kind in ("unique", "twofold", "continuous")]
+    assert curves[0]["y"][-1] == 0.75  # one of four pairs has no answer
     assert "R@5, unique answer" in page.said and "Configuration" in page.said and "torch" in page.said
+
+
+def test_the_marks_of_a_pair_are_at_its_poses_in_every_frame(tmp_path):
+    page = page_of(write_evaluation(tmp_path / "run"))
+    expected = example()
+    path = expected.trajectories[expected.chosen]
+    degrees = np.degrees(path[:, [1, 0]])
+    for kind in ("map", "surface"):
+        figure = page.figures[kind][-1]
+        meta = figure["layout"]["meta"]
+        answers = [points for trace, points in zip(meta["traces"], zip(*meta["frames"], strict=True), strict=True)
+                   if figure["data"][trace]["marker"]["symbol"] == "diamond"]  # fmt: skip
+        assert len(answers) == (1 if kind == "map" else 2) and len(meta["frames"]) == STEPS + 1
+        for points in answers:
+            np.testing.assert_allclose([[*each["x"], *each["y"]] for each in points], degrees, atol=1e-3)
+    heights = np.array([each["z"] for each in answers[0]])  # of the energy, a little above it
+    energy = expected.landscapes["energy of the prior"].energy.numpy()
+    assert energy.min() < heights.min() and heights.max() < energy.max() + 0.04 * np.ptp(energy)
+    figure = page.figures["cameras"][-1]
+    number = figure["layout"]["meta"]["traces"].index(len(figure["data"]) - 2)
+    frames = [frame[number] for frame in figure["layout"]["meta"]["frames"]]
+    poses = torch.from_numpy(expected.reference.pose + path)
+    x, y, z = camera_to_world(poses)[:, :3, 3].numpy().T
+    found = [[*each["x"], *each["y"], *each["z"]] for each in frames]
+    np.testing.assert_allclose(found, np.stack([x, -z, y]).T, atol=1e-3)
+
+
+def test_a_long_way_has_few_frames_and_its_last_step_among_them(tmp_path):
+    folder = write_evaluation(tmp_path / "run")
+    save_examples(folder / "pictures" / EXAMPLES, [example(steps=500)])
+    page = page_of(folder)
+    for kind in ("map", "surface", "cameras"):
+        (figure,) = page.figures[kind]
+        assert len(figure["layout"]["meta"]["frames"]) == 40
+    assert "step 500 of 500" in page.said
 
 
 @pytest.mark.parametrize(
@@ -339,15 +382,14 @@ def test_what_is_missing_or_damaged_is_said_and_the_rest_is_shown(kind, file, co
 
 def test_examples_that_are_too_large_are_left_out_from_the_end(tmp_path, monkeypatch):
     write_evaluation(tmp_path / "run")
-    monkeypatch.setattr(viewer, "LARGEST", 1)
+    monkeypatch.setattr(pairs_module, "LARGEST", 1)
     page = page_of(tmp_path / "run")
     assert "2 more would make the page too large" in page.said
-    (content,) = [each for each in page.data if isinstance(each, dict)]
-    assert [each["object"] for each in content["examples"]] == [NASTY]
+    assert cards(page) == [NASTY.replace("_", " ")] and len(page.figures["map"]) == 1
 
 
 def test_the_colours_are_those_of_the_figures():
-    text = (Path(run_page.__file__).parent / "page.css").read_text()
+    text = (Path(page_module.__file__).parent / "templates" / "page.css").read_text()
     light = text.partition("@media")[0]
     named = {"truth": style.TRUTH, "answer": style.ANSWER, "others": style.OTHERS, **style.CLASS_COLOURS}
     for name, colour in named.items():
@@ -375,20 +417,16 @@ def test_a_set_of_runs_has_each_of_them_to_be_opened(tmp_path):
     opened = {each["id"] for tag, each in page.elements if tag == "details" and each.get("class") == "run"}
     links = {each["href"].removeprefix("#") for tag, each in page.elements if tag == "a"}
     assert opened == links and len(opened) == 3
-    places = [int(each["data-of"]) for _, each in page.elements if "data-of" in each]
-    assert sorted(places) == list(range(len(page.data)))
 
 
 def test_runs_that_would_make_the_page_too_large_are_in_the_table_alone(tmp_path, monkeypatch):
     runs = [(write_evaluation(tmp_path / f"e{seed}", seed), "eval") for seed in range(3)]
     sizes = [len(Page(write_report_page(tmp_path / "one.html", runs[:1], [])).text)]
-    monkeypatch.setattr(run_page, "LARGEST", sizes[0] - 2_000_000)  # without plotly.js: room for one
+    monkeypatch.setattr(page_module, "LARGEST", sizes[0] - 2_000_000)  # without plotly.js: room for one
     page = Page(write_report_page(tmp_path / "report.html", runs, []))
     left_out = 3 - sum(tag == "details" and each.get("class") == "run" for tag, each in page.elements)
     assert left_out >= 1 and f"{left_out} runs would make this page too large" in page.said
     assert all(str(folder) in page.said for folder, _ in runs)
-    places = [int(each["data-of"]) for _, each in page.elements if "data-of" in each]
-    assert sorted(places) == list(range(len(page.data)))
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -514,41 +552,48 @@ def test_plots_follow_the_system_from_light_to_dark(opened, tmp_path):
     page.wait_for_function("document.querySelector('.plot').layout.font.color === '#e9e9e6'")
 
 
-POINTS = """[...document.querySelectorAll('.plot.map, .plot.surface, .plot.cameras')].map(
-    (plot) => plot.data.filter((trace) => trace.meta === 'moves').reduce((sum, trace) => sum + trace.x.length, 0))"""
+MARKS = """[...document.querySelectorAll('.stage:not([hidden]) .plot')].map((plot) =>
+    plot.layout.meta.traces.map((trace) => plot.data[trace]).map(({ x, y, z }) => [x, y, z]))"""
+FRAME = """(step) => [...document.querySelectorAll('.stage:not([hidden]) .plot')].map((plot) =>
+    plot.layout.meta.frames[step].map(({ x, y, z }) => [x, y, z]))"""
 
 
 @with_browser
 def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tmp_path):
     page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"))
     scroll_through(page)
-    slider = page.get_by_label("step of the solver")
+    slider = page.get_by_label("step of the solver").first
     assert slider.input_value() == slider.get_attribute("max") == str(STEPS)
-    at_the_end = page.evaluate(POINTS)
+    at_the_end = page.evaluate(MARKS)
+    assert at_the_end == page.evaluate(FRAME, STEPS)
     slider.fill("3")
-    early = page.evaluate(POINTS)
+    assert page.evaluate(MARKS) == page.evaluate(FRAME, 3) != at_the_end
     slider.press("ArrowRight")
-    assert slider.input_value() == "4" and "step 4 of 20" in page.locator(".player output").inner_text()
-    later = page.evaluate(POINTS)
-    assert all(a < b < c for a, b, c in zip(early, later, at_the_end, strict=True))
-    play = page.locator(".player button")
+    assert slider.input_value() == "4" and "step 4 of 20" in page.locator(".player output").first.inner_text()
+    assert page.evaluate(MARKS) == page.evaluate(FRAME, 4)
+    play = page.locator(".player button").first
     play.evaluate("(button) => { button.click(); button.click(); }")
     assert play.inner_text() == "Play" and slider.input_value() == "4"  # it has stopped where it was
     play.click()
     page.wait_for_function(f"document.querySelector('.player input').value === '{STEPS}'")
     page.wait_for_function("document.querySelector('.player button').textContent === 'Play'")
-    assert page.evaluate(POINTS) == at_the_end
+    assert page.evaluate(MARKS) == at_the_end
 
     cards = page.locator(".card")
     assert cards.count() == 3 and cards.first.get_attribute("aria-pressed") == "true"
-    assert "off by 170.0°" in page.locator(".told").inner_text()
+    assert "off by 170.0°" in page.locator(".told:visible").inner_text()
     cards.nth(2).press("Enter")
-    page.wait_for_function("document.querySelector('.told').innerText.includes('off by 3.0°')")
+    assert "off by 3.0°" in page.locator(".told:visible").inner_text()
     assert cards.nth(2).get_attribute("aria-pressed") == "true"
-    heights = "document.querySelector('.plot.surface').data[0].z[3][3]"
-    before = page.evaluate(heights)
-    page.get_by_label("landscape", exact=True).select_option("length of the model's score")
-    page.wait_for_function(f"Math.abs({heights} ** 2 - {before}) < 1e-3")
+    scroll_through(page)
+    assert page.locator(".plot.surface.drawn").count() == 1  # the one of the first pair has been put away
+    shown = "document.querySelector('.stage:not([hidden]) .plot.surface')._fullData.filter((trace) => trace.visible)"
+    assert page.evaluate(f"new Set({shown}.map((trace) => trace.meta)).size") == 1
+    page.locator("select:visible").select_option("length of the model's score")
+    assert page.evaluate(f"{shown}[0].meta") == "length of the model's score"
+    cards.nth(0).click()
+    scroll_through(page)
+    assert colours(page, ".plot.surface") > 100
 
 
 @with_browser

@@ -41,9 +41,9 @@ from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.geometry import apply_relative_pose
+from lp_framework.report.page import write_run_page
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.cameras import cameras_figure
-from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.style import save_figure
 
 log = logging.getLogger(__name__)

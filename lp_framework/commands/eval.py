@@ -36,9 +36,9 @@ from lp_framework.evaluation.journal import Journal, goes_on, unfinished
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
 from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.models.checkpoints import find_checkpoint
+from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Solver
 from lp_framework.solvers.starts import Starts
-from lp_framework.viz.html.run_page import write_run_page
 
 LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and many would be long unsaved
 LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 starts, 18 from 2

@@ -39,10 +39,10 @@ from lp_framework.data.photographs import on_white, photograph_files, prepared_p
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_arrays, write_json
 from lp_framework.geometry import wrap_angle
+from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.azimuth import azimuth_figure
-from lp_framework.viz.html.run_page import write_run_page
 from lp_framework.viz.maps import field_figure, pair_figure
 from lp_framework.viz.style import save_figure
 from lp_framework.viz.surface import surface_figure

@@ -44,7 +44,7 @@ from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, KeepRecipe, read_checkpoint
 from lp_framework.models.model_folder import RECIPE
 from lp_framework.models.pose_model import PoseModel
-from lp_framework.viz.html.run_page import write_run_page
+from lp_framework.report.page import write_run_page
 from lp_framework.viz.training import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name

@@ -1,4 +1,4 @@
-"""Tables of sweeps in print: their layout, in the terminal, as Markdown, CSV and JSON."""
+"""Tables of sweeps in print: their layout, in the terminal, as CSV and JSON."""
 
 from __future__ import annotations
 
@@ -85,9 +85,8 @@ def number(name: str, value: float) -> str:
     return f"{value:.3f}"
 
 
-def terminal(table: SweepTable) -> Table:
+def terminal(content: Layout) -> Table:
     """The layout for a terminal: spreads below the means, the paper's rows dim."""
-    content = layout(table)
     printed = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for place, name in enumerate(content.headings):
         if place < content.labels:
@@ -100,19 +99,6 @@ def terminal(table: SweepTable) -> Table:
         cells = [_short(cell) if place >= content.labels else cell for place, cell in enumerate(line.cells)]
         printed.add_row(*(Text.assemble((cell, style), (more, "dim")) for cell, more in zip(cells, below, strict=True)))
     return printed
-
-
-def markdown(table: SweepTable) -> list[str]:
-    """The layout as lines of Markdown: means ± spreads, the paper's rows in italics."""
-    content = layout(table)
-    lines = [_markdown_row(content.headings), _markdown_row(["---"] * content.labels + ["---:"] * (
-        len(content.headings) - content.labels))]  # fmt: skip
-    for line in content.lines:
-        cells = [
-            f"{cell} ± {spread}" if spread else cell for cell, spread in zip(line.cells, line.spreads, strict=True)
-        ]
-        lines.append(_markdown_row([f"*{cell}*" if line.paper and cell else cell for cell in cells]))
-    return lines
 
 
 def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]]]:
@@ -253,7 +239,3 @@ def _broken(name: str) -> str:
     """A heading in two lines where it is a metric's: `R(R)@5` as `@5` above `R(R)`."""
     prefix, at, degrees = name.partition("@")
     return f"@{degrees}\n{prefix}" if at else name.replace(" ", "\n")
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -145,10 +145,18 @@ def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
     if file is None:
         return {"checkpoint": checkpoint}
     try:
-        config: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
-        return {"checkpoint": json.dumps({**settings(config), "file": path.name}, sort_keys=True)}
-    except (OSError, YAMLError, OmegaConfBaseException, AttributeError, RecursionError):
+        return {"checkpoint": json.dumps({**settings(saved_config(file)), "file": path.name}, sort_keys=True)}
+    except UserError:
         return {"checkpoint": checkpoint}
+
+
+def saved_config(file: Path) -> dict[str, Any]:
+    """The `config.yaml` of a training run, resolved; `UserError` where it is missing or damaged."""
+    try:
+        content: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
+        return dict(content)
+    except (OSError, ValueError, TypeError, YAMLError, OmegaConfBaseException, RecursionError) as error:
+        raise UserError(f"{file}: is missing or damaged ({type(error).__name__})") from error
 
 
 def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:

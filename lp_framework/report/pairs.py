@@ -1,0 +1,80 @@
+"""Pairs of an evaluation on a page: a card each, and the landscape, the map and the cameras of the one chosen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from lp_framework.evaluation.examples import Example
+from lp_framework.report.parts import packed
+from lp_framework.report.plots import frame_steps, map_plot, pair_cameras_plot, surface_plot
+
+LARGEST = 4_000_000  # letters that the plots of one run's pairs may take; the last ones are left out beyond it
+VALLEYS = 4  # of a landscape, told by their places
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A pair with its plots (packed, by kind), the steps that their frames show, and what is told of it."""
+
+    example: Example
+    plots: Mapping[str, str]
+    steps: Sequence[int]
+    told: Mapping[str, str]
+
+
+def pairs(examples: Sequence[Example]) -> dict[str, Any]:
+    """What the template `pairs` shows of examples."""
+    shown: list[Pair] = []
+    size = 0
+    for example in examples:
+        kinds = {"map": map_plot, "cameras": pair_cameras_plot}
+        if example.landscapes:
+            kinds["surface"] = surface_plot
+        plots = {kind: packed(draw(example).to_json()) for kind, draw in kinds.items()}
+        size += sum(map(len, plots.values()))
+        if shown and size > LARGEST:
+            break
+        shown.append(Pair(example, plots, frame_steps(example), told(example)))
+    return {
+        "pairs": shown,
+        "left_out": len(examples) - len(shown),
+        "failures": sum(pair.example.failed for pair in shown),
+        "plays": any(len(pair.steps) > 1 for pair in shown),
+    }
+
+
+def told(example: Example) -> dict[str, str]:
+    """What is to be said of a pair in words, by its name."""
+    rotation, translation = (each[example.chosen] for each in (example.rotation_errors, example.translation_errors))
+    off = [f"{rotation:.1f}°"] * math.isfinite(rotation) + [f"{translation:.2f}"] * math.isfinite(translation)
+    answer = _pose(example.ends[example.chosen]) + (f": off by {' and '.join(off)}" if off else "")
+    truth = {} if example.truth is None else {"true relative pose": _pose(example.truth)}
+    valleys = {}
+    for name, landscape in example.landscapes.items():
+        minima = landscape.minima()
+        places = "; ".join(f"{_angle(each.latitude)}, {_turned(each.longitude)}" for each in minima[:VALLEYS])
+        count = "one valley, at" if len(minima) == 1 else f"{len(minima)} valleys, the deepest first:"
+        valleys[name] = f"{count} {places}{'; …' if len(minima) > VALLEYS else ''}" if minima else "no valley"
+    return {"pair": example.reason, **truth, "answer": answer, **valleys}
+
+
+def _pose(pose: NDArray) -> str:
+    latitude, longitude, radius = pose
+    return f"latitude {_angle(latitude)}, longitude {_turned(longitude)}, radius {_signed(radius, 2)}"
+
+
+def _turned(angle: float) -> str:
+    return _angle(angle % (2 * math.pi))
+
+
+def _angle(radians: float) -> str:
+    return f"{_signed(math.degrees(radians), 1)}°" if math.isfinite(radians) else "none"
+
+
+def _signed(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") if math.isfinite(value) else "none"

@@ -1,0 +1,412 @@
+"""The interactive plots of a page, as figures of plotly.
+
+Colours are CSS variables of the page, which its script fills in for the light or the dark scheme. In the plots of a
+pair the ways of all starts stand still, and frames move the marks on them: the layout's `meta` has the numbers of the
+`traces` that move, and in `frames` their points at each step that is shown. (Plotly's own frames are traces, which take
+long to make.) A trace whose `meta` names a landscape is shown while that one is chosen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import plotly.graph_objects as go
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.interpolate import RegularGridInterpolator
+
+from lp_framework.data.photographs import FIELD_OF_VIEW_DEGREES
+from lp_framework.evaluation.examples import Example
+from lp_framework.evaluation.landscape import Landscape
+from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
+from lp_framework.geometry import camera_to_world
+from lp_framework.viz.cameras import image_plane, ring
+from lp_framework.viz.errors_plot import cumulative
+from lp_framework.viz.fields import broken_at_seam
+from lp_framework.viz.landscape import RELIEF, closed
+from lp_framework.viz.training import LOSSES, Curve, running_mean
+
+INK, MUTED, LINE, SURFACE, HALO, TRUTH, ANSWER, OTHERS, REFERENCE, GREY = (
+    f"var(--{name})"
+    for name in ("ink", "muted", "line", "surface", "halo", "truth", "answer", "others", "reference", "unlabelled")
+)  # fmt: skip
+WHITE, DARK = "#ffffff", "#3A3A3A"  # over a landscape, which is the same in both schemes
+FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK}
+PLACE = "longitude %{x:.1f}°, latitude %{y:.1f}°"
+FRAMES = 40  # of a pair, at most
+ERROR_POINTS, LOSS_POINTS = 400, 2000  # of a curve
+PIXELS = 32  # a side of an image in space
+GLOBE = 0.42  # object sizes, the radius
+OUTLINE = [0, 1, 2, 3, 0, 4, 1, 2, 4, 3]  # all edges of a frustum in one line
+
+Points = Callable[[NDArray], NDArray]  # from poses [S, 3] to points [T, 2] of the map, or [T, 3] in space
+
+
+class Moving(NamedTuple):
+    """A trace that the frames move: its number, ways `[_, S, 3]`, and where a step of those is drawn."""
+
+    trace: int
+    paths: NDArray
+    place: Points
+
+
+def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
+    """The share of pairs within a rotation error, for each class of objects its errors `[P]` (degrees, NaN: none)."""
+    ticks = [0, *ROTATION_THRESHOLDS, 60, 90, 120, 180]
+    across = {"tickvals": [math.sqrt(each) for each in ticks], "ticktext": [f"{each}°" for each in ticks]}
+    figure = _figure(
+        xaxis=_axis("rotation error (square-root scale)", range=[0, math.sqrt(180)], **across),
+        yaxis=_axis("share of pairs within the error", range=[0, 1.01], tickformat=".0%"),
+        legend=_legend(yanchor="bottom", y=0.03),
+    )
+    for threshold in ROTATION_THRESHOLDS:
+        figure.add_vline(math.sqrt(threshold), line={"color": MUTED, "width": 1, "dash": "dot"})
+    for name, values in errors.items():
+        error, share = cumulative(values, 180.0)
+        kept = np.unique(np.linspace(0, len(error) - 1, ERROR_POINTS).round().astype(int))
+        figure.add_scatter(
+            x=_numbers(np.sqrt(error[kept])), y=_numbers(share[kept], 5), customdata=_numbers(error[kept]),
+            name=f"{name} ({len(values)} pairs)", mode="lines",
+            line={"color": f"var(--{name})", "width": 2.5, "shape": "hv"},
+            hovertemplate="%{y:.1%} of pairs within %{customdata:.1f}°<extra>%{fullData.name}</extra>",
+        )  # fmt: skip
+    return figure
+
+
+def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
+    """Losses by their logged names over the steps, and below them the learning rate where there is one.
+
+    Where there are many records they are pale, and their running mean is drawn over them.
+    """
+    loss = {"type": "log", "domain": [0 if rate is None else 0.32, 1], "dtick": "D2", "tickformat": "~g"}
+    figure = _figure(
+        xaxis=_axis("training step", anchor="y" if rate is None else "y2"), yaxis=_axis("loss (log scale)", **loss),
+        yaxis2=_axis("rate", domain=[0, 0.22], rangemode="tozero", nticks=3, exponentformat="e"),
+        legend=_legend(yanchor="top", y=0.99), margin={"l": 64, "r": 16, "t": 10, "b": 44},
+    )  # fmt: skip
+    for (name, curve), colour in zip(losses.items(), (REFERENCE, ANSWER, GREY), strict=False):
+        line = {"color": colour, "width": 2}
+        if (window := len(curve.step) // 20) > 1:
+            pale = {"line": {**line, "width": 1}, "opacity": 0.3, "hoverinfo": "skip", "showlegend": False}
+            figure.add_scatter(**_thinned(curve), mode="lines", **pale)
+            curve = Curve(curve.step, running_mean(curve.value, window))
+        mode = "lines" if len(curve.step) > 30 else "lines+markers"
+        figure.add_scatter(**_thinned(curve), name=LOSSES[name][1], mode=mode, line=line)
+    if rate is not None:
+        line = {"color": INK, "width": 1.5}
+        figure.add_scatter(**_thinned(rate), yaxis="y2", name="learning rate", mode="lines", line=line)
+    return figure
+
+
+def cameras_plot(poses: NDArray, images: Sequence[NDArray]) -> go.Figure:
+    """Cameras at view poses `[V, 3]` with their images `[S, S, 4]`; that of the first also stands for the object."""
+    furthest = float(poses[:, 2].max())
+    figure = _space(1.1 * furthest, poses[0, 1])
+    figure.add_trace(_image(_frustum(poses[0], poses[0, 2]), images[0], 2 * PIXELS))
+    colours = [REFERENCE, *[ANSWER] * (len(poses) - 1)]
+    for pose, image, colour in zip(poses, images, colours, strict=True):
+        frustum = _frustum(pose, furthest * (0.26 if len(poses) > 5 else 0.34))
+        figure.add_traces([_image(frustum, image), _line(frustum[OUTLINE], colour, 4)])
+    text = {"text": [str(number) for number in range(len(poses))], "textposition": "top center", "textfont": FONT}
+    marker = {"color": colours, "size": 5}
+    return figure.add_trace(_trace(_centres(poses), mode="markers+text", marker=marker, hoverinfo="text", **text))
+
+
+# ---------------------------------------------------------------- a pair
+
+
+def frame_steps(example: Example) -> list[int]:
+    """The steps of the solver that the frames of a pair show, the last one among them."""
+    steps: list[int] = np.unique(np.linspace(0, _ways(example).shape[1] - 1, FRAMES).round().astype(int)).tolist()
+    return steps
+
+
+def map_plot(example: Example) -> go.Figure:
+    """A pair's landscapes from above (degrees), and the ways of all starts over them."""
+    ends = [pose[0] for pose in (example.truth, example.ends[example.chosen]) if pose is not None]
+    limit = max(60.0, *(abs(math.degrees(each)) + 5 for each in np.nan_to_num(ends)))
+    angle = {"ticksuffix": "°", "zeroline": False}
+    figure = _figure(
+        xaxis=_axis("relative longitude", range=[0, 360], dtick=60, **angle),
+        yaxis=_axis("relative latitude", range=[-limit, limit], dtick=30, **angle),
+    )
+    bar = {"orientation": "h", "thickness": 8, "xpad": 0, "ypad": 6, "y": 1.0, "yanchor": "bottom", "outlinewidth": 0,
+           "tickfont": {"size": 10}, "nticks": 6}  # fmt: skip
+    for name, landscape in example.landscapes.items():
+        figure.add_contour(
+            **_relief(name, landscape), **_of(example, name), ncontours=14, contours={"coloring": "heatmap"},
+            line={"color": "rgba(255,255,255,0.35)", "width": 0.7},
+            colorbar={**bar, "title": {"text": name, "side": "top", "font": {"size": 11}}},
+        )  # fmt: skip
+    others, halo = (DARK, WHITE) if example.landscapes else (OTHERS, HALO)
+    if example.starts is not None:
+        _add_marks(figure, _on_map(example.starts), "start", WHITE, 8, line={"color": DARK, "width": 1.6})
+    if example.truth is not None:
+        edge = {"color": "#222222", "width": 1.2}
+        _add_marks(figure, _on_map(example.truth[None]), "true pose", TRUTH, 19, symbol="star", line=edge)
+    _add_trails(figure, example, _along_map, (halo, halo), (3.2, 5))
+    _add_trails(figure, example, _along_map, (others, ANSWER), (1.4, 2.8))
+    edge = {"color": WHITE, "width": 1.2}
+    return _framed(figure, example, _add_moving(figure, example, _on_map, others, (8, 12), line=edge))
+
+
+def surface_plot(example: Example) -> go.Figure:
+    """A pair's landscapes as relief, with the ways of all starts on it; the truth is a pole."""
+    angle = {"ticksuffix": "°", "showspikes": False}
+    axes = {
+        "xaxis": _axis("longitude", range=[0, 360], dtick=90, **angle),
+        "yaxis": _axis("latitude", dtick=30, **angle),
+        "zaxis": _axis("", nticks=4, showspikes=False),
+    }
+    eye, centre = {"x": -0.5, "y": -1.65, "z": 2.1}, {"x": 0, "y": 0, "z": -0.15}
+    figure = _scene({"x": 1.7, "y": 1, "z": 0.65}, eye, centre, **axes)
+    moving: list[Moving] = []
+    for name, landscape in example.landscapes.items():
+        only = _of(example, name)
+        light = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.05}
+        figure.add_surface(**_relief(name, landscape), **only, showscale=False, lighting=light)
+        place, along = _raised(landscape, _on_map), _raised(landscape, _along_map)
+        if example.truth is not None:
+            pole = np.repeat(place(example.truth[None]), 2, axis=0)
+            pole[1, 2] = landscape.energy.max().item()
+            figure.add_trace(_line(pole, TRUTH, 5, **only))
+            _add_marks(figure, pole[1:], "true pose", TRUTH, 8, symbol="diamond", **only)
+        _add_trails(figure, example, along, (WHITE, ANSWER), (3, 8), **only)
+        moving += _add_moving(figure, example, place, DARK, (5, 7), line={"color": WHITE, "width": 1}, **only)
+    return _framed(figure, example, moving)
+
+
+def pair_cameras_plot(example: Example) -> go.Figure:
+    """The cameras of a pair around a globe that bears the landscapes: both with their images, and where the ways go."""
+    reference = example.reference.pose
+    distance = 0.32 * reference[2]
+    query = None if example.truth is None else reference + example.truth
+    figure = _space(1.1 * max(reference[2], 0.0 if query is None else query[2]), reference[1])
+    look: dict[str, Any] = {"lighting": {"ambient": 0.9, "diffuse": 0.3, "specular": 0}, "hoverinfo": "skip"}
+    if example.landscapes:  # the plain core fills the poles
+        core = np.linspace(-math.pi / 2, math.pi / 2, 13), np.linspace(0, 2 * math.pi, 31)
+        figure.add_mesh3d(**_ball(*core, GLOBE - 0.02), color=LINE, **look)
+    for name, landscape in example.landscapes.items():
+        latitude, longitude, energy = closed(landscape)
+        ball = _ball(np.radians(latitude) + reference[0], np.radians(longitude) + reference[1], GLOBE)
+        shade = {"intensity": _numbers(energy.ravel(), 5), "colorscale": RELIEF, "showscale": False}
+        figure.add_mesh3d(**ball, **shade, **_of(example, name), **look)
+    for pose, view, colour in ((reference, example.reference, REFERENCE), (query, example.query, TRUTH)):
+        if pose is not None:
+            frustum = _frustum(pose, distance)
+            figure.add_traces([_image(frustum, view.image), _line(frustum[OUTLINE], colour, 5)])
+
+    def centres(poses: NDArray) -> NDArray:
+        return _centres(reference + poses)
+
+    def outline(poses: NDArray) -> NDArray:
+        return _frustum(reference + poses[0], distance)[OUTLINE]
+
+    _, answer = _parts(example)
+    _add_trails(figure, example, centres, (OTHERS, ANSWER), (2, 5))
+    moving = _add_moving(figure, example, centres, OTHERS, (4, 6))
+    figure.add_trace(_line(outline(answer[:, -1]), ANSWER, 5))
+    return _framed(figure, example, [*moving, Moving(len(figure.data) - 1, answer, outline)])
+
+
+def _ways(example: Example) -> NDArray:
+    """Trajectories `[N, S, 3]`; of solvers that keep none, where the starts ended, `[N, 1, 3]`."""
+    return example.ends[:, None] if example.trajectories is None else example.trajectories
+
+
+def _parts(example: Example) -> tuple[NDArray, NDArray]:
+    """The ways `[_, S, 3]` of the other starts, and of the answer."""
+    paths = _ways(example)
+    return np.delete(paths, example.chosen, axis=0), paths[[example.chosen]]
+
+
+def _of(example: Example, landscape: str) -> dict[str, Any]:
+    """What marks a trace as one of a landscape; the first one is shown."""
+    return {"meta": landscape, "visible": landscape == next(iter(example.landscapes))}
+
+
+def _relief(name: str, landscape: Landscape) -> dict[str, Any]:
+    """A landscape for a contour or a surface."""
+    latitude, longitude, energy = closed(landscape)
+    hover = f"{PLACE}: %{{z:.4g}}<extra>{name}</extra>"
+    values = {"x": _numbers(longitude), "y": _numbers(latitude), "z": _numbers(energy, 5)}
+    return {**values, "colorscale": RELIEF, "hovertemplate": hover}
+
+
+def _add_trails(
+    figure: go.Figure, example: Example, along: Points, colours: Sequence[str], widths: Sequence[float], **more: Any
+) -> None:
+    """Two traces of lines: the ways of the other starts, and the answer's."""
+    for paths, colour, width in zip(_parts(example), colours, widths, strict=True):
+        known = [path[np.isfinite(path).all(axis=-1)] for path in paths]
+        points = [np.pad(along(path), ((0, 1), (0, 0)), constant_values=np.nan) for path in known if len(path)]
+        if points:
+            figure.add_trace(_line(np.concatenate(points), colour, width, **more))
+
+
+def _add_moving(
+    figure: go.Figure, example: Example, place: Points, others: str, sizes: Sequence[float], **more: Any
+) -> list[Moving]:
+    """Two traces of marks at the ends of the ways, for the other starts and for the answer."""
+    kinds = (("another start", others, "circle"), ("answer", ANSWER, "diamond"))
+    first = len(figure.data)
+    for paths, (name, colour, symbol), size in zip(_parts(example), kinds, sizes, strict=True):
+        _add_marks(figure, place(paths[:, -1]), name, colour, size, symbol=symbol, **more)
+    return [Moving(number, paths, place) for number, paths in enumerate(_parts(example), first)]
+
+
+def _framed(figure: go.Figure, example: Example, moving: Sequence[Moving]) -> go.Figure:
+    """The figure with its frames, one for each of `frame_steps`."""
+    frames = [[_xyz(each.place(each.paths[:, step])) for each in moving] for step in frame_steps(example)]
+    return figure.update_layout(meta={"traces": [each.trace for each in moving], "frames": frames})
+
+
+def _on_map(poses: NDArray) -> NDArray:
+    """Relative poses `[S, 3]` on the map: longitude and latitude `[S, 2]`, degrees."""
+    return np.stack([np.degrees(poses[:, 1]) % 360, np.degrees(poses[:, 0])], axis=-1)
+
+
+def _along_map(path: NDArray) -> NDArray:
+    """A path `[S, 3]` on the map, with a gap (NaN) where it crosses the seam."""
+    latitude, longitude = broken_at_seam(np.degrees(path[:, 0]), np.degrees(path[:, 1]))
+    return np.stack([longitude, latitude], axis=-1)
+
+
+def _raised(landscape: Landscape, place: Points) -> Points:
+    """`place`, with the height of the landscape there, a little above it."""
+    latitude, longitude, energy = closed(landscape)
+    height = RegularGridInterpolator((latitude, longitude), energy, bounds_error=False)
+    lift = 0.03 * (np.ptp(energy) or 1.0)
+
+    def raised(poses: NDArray) -> NDArray:
+        points = place(poses)
+        inside = np.stack([points[:, 1].clip(latitude[0], latitude[-1]), points[:, 0]], axis=-1)
+        return np.column_stack([points, height(inside) + lift])
+
+    return raised
+
+
+# ---------------------------------------------------------------- cameras
+
+
+def _space(radius: float, longitude: float) -> go.Figure:
+    """The ground with its longitudes, for cameras at most `radius` away, seen from above a longitude."""
+    x, y, _ = 1.9 * _standing(np.array([math.sin(longitude + 0.6), 0.0, math.cos(longitude + 0.6)]))
+    sides = {"xaxis": 1.3, "yaxis": 1.3, "zaxis": 1.1}
+    axes = {name: {"visible": False, "range": [-most * radius, most * radius]} for name, most in sides.items()}
+    figure = _scene({"x": 2, "y": 2, "z": 1.7}, {"x": x, "y": y, "z": 1}, {"x": 0, "y": 0, "z": -0.05}, **axes)
+    around, gap = _standing(ring(radius)), np.full(3, np.nan)  # a point every two degrees
+    spokes = [point for spoke in around[:180:15] for point in (0.35 * spoke, spoke, gap)]
+    figure.add_trace(_line(np.stack([*around, gap, *spokes]), LINE, 2))
+    text = {"text": ["0°", "90°", "180°", "270°"], "textfont": {"color": MUTED, "size": 11}}
+    return figure.add_trace(_trace(1.12 * around[:180:45], mode="text", hoverinfo="skip", **text))
+
+
+def _standing(points: NDArray) -> NDArray:
+    """Points `[..., 3]` in plotly's space, where +Z is up and not +Y."""
+    return points[..., [0, 2, 1]] * [1, -1, 1]
+
+
+def _centres(poses: NDArray) -> NDArray:
+    """Where cameras at view poses `[V, 3]` are, `[V, 3]` in plotly's space."""
+    return _standing(camera_to_world(torch.from_numpy(poses))[:, :3, 3].numpy())
+
+
+def _frustum(pose: NDArray, distance: float) -> NDArray:
+    """The corners of what a camera sees at a distance, as `image_plane` has them, and its centre: `[5, 3]`."""
+    camera = camera_to_world(torch.from_numpy(pose)).numpy()
+    plane = image_plane(camera, distance, math.radians(FIELD_OF_VIEW_DEGREES) / 2)
+    return _standing(np.vstack([plane, camera[:3, 3]]))
+
+
+def _image(frustum: NDArray, image: NDArray, side: int = PIXELS) -> go.Mesh3d:
+    """An image `[S, S, 3 or 4]` without its white ground, on the image plane of a camera."""
+    pixels = np.asarray(Image.fromarray(image).convert("RGBA").resize((side, side))).reshape(-1, 4)
+    shown = (pixels[:, 3] >= 128) & (pixels[:, :3].min(axis=1) <= 246)
+    lower_left, lower_right, _, upper_left, _ = frustum
+    share = np.linspace(0, 1, side + 1)[:, None]
+    points = upper_left + share[:, None] * (lower_left - upper_left) + share * (lower_right - lower_left)
+    colours = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue, _ in pixels[shown]]
+    light = {"ambient": 1, "diffuse": 0, "specular": 0, "fresnel": 0}
+    return go.Mesh3d(**_mesh(points, shown), facecolor=colours * 2, hoverinfo="skip", lighting=light)
+
+
+def _ball(latitude: NDArray, longitude: NDArray, radius: float) -> dict[str, Any]:
+    """The mesh of a part of a sphere, of latitudes `[A]` and longitudes `[O]`; a surface would take longer to draw."""
+    up, east = np.meshgrid(latitude.clip(-math.pi / 2, math.pi / 2), longitude, indexing="ij")
+    points = _centres(np.stack([up, east, np.full_like(up, radius)], axis=-1).reshape(-1, 3))
+    return _mesh(points.reshape(*up.shape, 3), np.ones((len(latitude) - 1) * (len(longitude) - 1), dtype=bool))
+
+
+def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
+    """Two triangles for each of the cells `[R * C]` that are `shown`, of a grid of points `[R + 1, C + 1, 3]`."""
+    rows, columns = points.shape[0] - 1, points.shape[1] - 1
+    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()[shown]
+    below = corner + columns + 1
+    corners = {"i": (corner, corner + 1), "j": (below, below), "k": (corner + 1, below + 1)}
+    return {**_xyz(points.reshape(-1, 3)), **{name: np.concatenate(both).tolist() for name, both in corners.items()}}
+
+
+# ---------------------------------------------------------------- pieces of figures
+
+
+def _figure(**layout: Any) -> go.Figure:
+    look = {
+        "template": "none", "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "font": FONT,
+        "showlegend": "legend" in layout, "margin": {"l": 54, "r": 16, "t": 10, "b": 44}, "hovermode": "closest",
+        "hoverlabel": {"bgcolor": SURFACE, "bordercolor": LINE, "font": {"color": INK}},
+        "uirevision": "kept",  # zoom and viewpoint stay when colours change
+    }  # fmt: skip
+    return go.Figure(layout={**look, **layout})
+
+
+def _scene(
+    aspect: Mapping[str, float], eye: Mapping[str, float], center: Mapping[str, float], **axes: Any
+) -> go.Figure:
+    view = {"aspectmode": "manual", "aspectratio": aspect, "dragmode": "turntable"}
+    return _figure(margin=dict.fromkeys("lrtb", 0), scene={**axes, **view, "camera": {"eye": eye, "center": center}})
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    lines = {"gridcolor": LINE, "linecolor": LINE, "zerolinecolor": LINE}
+    return {"title": {"text": title, "font": {"color": MUTED}}, **lines, **more}
+
+
+def _legend(**place: Any) -> dict[str, Any]:
+    return {"x": 0.99, "xanchor": "right", "bgcolor": SURFACE, "bordercolor": LINE, "borderwidth": 1, **place}
+
+
+def _line(points: NDArray, colour: str, width: float, **more: Any) -> go.Scatter | go.Scatter3d:
+    return _trace(points, mode="lines", line={"color": colour, "width": width}, hoverinfo="skip", **more)
+
+
+def _add_marks(
+    figure: go.Figure, points: NDArray, name: str, colour: str, size: float, symbol: str = "circle",
+    line: Mapping[str, Any] | None = None, **more: Any,
+) -> None:  # fmt: skip
+    on_map = {"hovertemplate": f"{PLACE}<extra>{name}</extra>", "cliponaxis": False}
+    more |= on_map if points.shape[1] == 2 else {"hoverinfo": "skip"}
+    marker = {"color": colour, "size": size, "symbol": symbol, "line": line}
+    figure.add_trace(_trace(points, mode="markers", marker=marker, **more))
+
+
+def _trace(points: NDArray, **more: Any) -> go.Scatter | go.Scatter3d:
+    """Points `[T, 2]` on the map, or `[T, 3]` in space."""
+    return (go.Scatter if points.shape[1] == 2 else go.Scatter3d)(**_xyz(points), **more)
+
+
+def _xyz(points: NDArray) -> dict[str, list[float]]:
+    return dict(zip("xyz", _numbers(points.T), strict=False))
+
+
+def _thinned(curve: Curve) -> dict[str, list[float]]:
+    every = -(-len(curve.step) // LOSS_POINTS)
+    return {"x": curve.step[::every].tolist(), "y": [float(f"{value:.5g}") for value in curve.value[::every]]}
+
+
+def _numbers(values: NDArray, digits: int = 3) -> Any:
+    return np.round(values, digits).tolist()

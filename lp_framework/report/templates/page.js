@@ -1,0 +1,163 @@
+"use strict";
+// Tables that sort, plots that are drawn when they come into view, and pairs along whose ways a slider moves the marks.
+(() => {
+  // ------------------------------------------------------------ tables
+
+  for (const table of document.querySelectorAll("table[data-sorts]")) {
+    const heads = [...table.tHead.rows[0].cells];
+    heads.forEach((head, column) =>
+      head.firstElementChild.addEventListener("click", () => {
+        // Numbers begin with the largest, words with the first.
+        const [first, other] = head.classList.contains("number") ? ["descending", "ascending"] : ["ascending", "descending"];
+        const order = head.getAttribute("aria-sort") === first ? other : first;
+        for (const each of heads) each.setAttribute("aria-sort", each === head ? order : "none");
+        sortRows(table.tBodies[0], column, order === "ascending" ? 1 : -1);
+      }),
+    );
+  }
+
+  function sortRows(body, column, sign) {
+    const keys = new Map([...body.rows].map((row) => [row, sortKey(row.cells[column])]));
+    const compare = (a, b) => {
+      if (a === "" || b === "") return (a === "") - (b === ""); // what has no value is last either way
+      if (typeof a === "number" && typeof b === "number") return sign * (a - b);
+      return sign * String(a).localeCompare(String(b), undefined, { numeric: true });
+    };
+    body.append(...[...body.rows].sort((a, b) => compare(keys.get(a), keys.get(b))));
+  }
+
+  // A number that the text begins with, else the text.
+  function sortKey(cell) {
+    const text = (cell.dataset.value ?? cell.textContent.trim()).replace("\u2212", "-").replace(/^(inf|\u221e)$/, "Infinity");
+    const number = parseFloat(text);
+    return Number.isNaN(number) || cell.classList.contains("word") ? text : number;
+  }
+
+  // ------------------------------------------------------------ runs of a set
+
+  function openRun() {
+    const run = location.hash && document.getElementById(location.hash.slice(1));
+    if (run instanceof HTMLDetailsElement) {
+      run.open = true;
+      run.scrollIntoView();
+    }
+  }
+  addEventListener("hashchange", openRun);
+  openRun();
+
+  // ------------------------------------------------------------ plots
+
+  async function unpack(packed) {
+    const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
+    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+  }
+
+  let library = null; // the promise of plotly.js, which is unpacked once
+  const plotly = () => (library ??= (async () => {
+    const script = document.createElement("script");
+    script.textContent = await unpack(document.getElementById("plotly").textContent);
+    document.head.append(script);
+    return window.Plotly;
+  })());
+
+  const CONFIG = { displaylogo: false, responsive: true, scrollZoom: false, displayModeBar: false };
+  const drawn = new Map(); // element: its figure, in the colours of the moment
+
+  async function draw(element) {
+    try {
+      const [text] = await Promise.all([unpack(element.dataset.figure), plotly()]);
+      const colours = getComputedStyle(document.documentElement);
+      const inColour = text.replace(/var\((--\w+)\)/g, (_, name) => colours.getPropertyValue(name).trim());
+      drawn.set(element, JSON.parse(inColour));
+      element.classList.add("drawn");
+      await show(element);
+    } catch (error) {
+      element.classList.replace("drawn", "failed");
+      element.dataset.failed = `This browser cannot draw the plot (${error.message}).`;
+    }
+  }
+
+  // A plot as it is; in the stage of a pair with its marks at the slider's step, over the landscape that is chosen.
+  function show(element) {
+    const { data, layout } = drawn.get(element);
+    const [slider, choice] = ["input", "select"].map((name) => element.closest(".stage")?.querySelector(name));
+    if (slider) layout.meta.frames[slider.value].forEach((points, place) => Object.assign(data[layout.meta.traces[place]], points));
+    if (choice) for (const trace of data) if (trace.meta) trace.visible = trace.meta === choice.value;
+    return window.Plotly.react(element, data, layout, CONFIG);
+  }
+
+  const comesIntoView = new IntersectionObserver((entries) => {
+    for (const { target, isIntersecting } of entries) {
+      if (!isIntersecting) continue;
+      comesIntoView.unobserve(target);
+      draw(target);
+    }
+  }, { rootMargin: "200px" });
+  for (const element of document.querySelectorAll(".plot")) comesIntoView.observe(element);
+
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    for (const element of drawn.keys()) draw(element);
+  });
+
+  // ------------------------------------------------------------ pairs
+
+  for (const pairs of document.querySelectorAll(".pairs")) {
+    const [cards, stages] = [".card", ".stage"].map((name) => [...pairs.querySelectorAll(name)]);
+    stages.forEach(startStage);
+    cards.forEach((card, chosen) => card.addEventListener("click", () => {
+      cards.forEach((each, place) => each.setAttribute("aria-pressed", String(place === chosen)));
+      stages.forEach((stage, place) => {
+        stage.hidden = place !== chosen;
+        if (stage.hidden) stage.querySelectorAll(".plot.drawn").forEach(putAway);
+      });
+    }));
+  }
+
+  // Browsers keep few drawings in space at a time: those of a hidden pair go, and are made anew when it is shown.
+  function putAway(element) {
+    window.Plotly.purge(element);
+    drawn.delete(element);
+    element.classList.remove("drawn");
+    comesIntoView.observe(element);
+  }
+
+  // The player of a pair: its slider moves the marks of all three plots.
+  function startStage(stage) {
+    const [slider, play, output, choice] = ["input", "button", "output", "select"].map((name) => stage.querySelector(name));
+    const update = () => stage.querySelectorAll(".plot.drawn").forEach(show);
+    choice?.addEventListener("change", update);
+    if (!slider) return;
+    const steps = stage.dataset.steps.split(" ");
+    const last = steps.length - 1;
+    let playing = null;
+
+    function go(place) {
+      slider.value = String(place);
+      output.textContent = `step ${steps[place]} of ${steps[last]}`;
+      update();
+    }
+
+    function stop() {
+      cancelAnimationFrame(playing);
+      playing = null;
+      play.textContent = "Play";
+    }
+
+    function start() {
+      const from = Number(slider.value) === last ? 0 : Number(slider.value);
+      const began = performance.now();
+      const tick = (now) => {
+        const place = Math.min(last, from + Math.floor(((now - began) / 6000) * last)); // all of it takes six seconds
+        if (place !== Number(slider.value)) go(place);
+        if (place === last || stage.hidden) stop();
+        else playing = requestAnimationFrame(tick);
+      };
+      play.textContent = "Pause";
+      go(from);
+      playing = requestAnimationFrame(tick);
+    }
+
+    slider.addEventListener("input", () => { stop(); go(Number(slider.value)); });
+    play.addEventListener("click", () => (playing === null ? start() : stop()));
+  }
+})();

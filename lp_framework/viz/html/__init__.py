@@ -1,1 +1,0 @@
-"""Pages of finished runs: one self-contained HTML file each, drawn from what the runs left on disk."""
