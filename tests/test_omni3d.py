@@ -220,15 +220,15 @@ def test_errors_are_in_degrees_and_in_units_where_the_reference_stands_at_185(ro
         assert metrics["translation_error"] == pytest.approx(chord * 1.85 * (1 + 1.05) / 2, abs=1e-5)
 
 
-def test_results_are_a_solution(root, tmp_path):
+def test_results_are_relative_poses(root, tmp_path):
     write_results(tmp_path / "outputs", (0.0, 0.0, 0.0))
     found = read_idpose_results(tmp_path / "outputs", omni3d_objects(root))
-    assert (found.objects, found.references, found.queries) == (["dinosaur_002"] * 2, ["011"] * 2, ["001", "077"])
+    assert [pair[:3] for pair in found] == [("dinosaur_002", "011", "001"), ("dinosaur_002", "011", "077")]
     cameras = omni3d_cameras(root, "dinosaur_002")
     poses = {view: view_pose(camera) for view, camera in cameras.items()}
-    expected = torch.stack([relative_pose(poses["011"], poses[view]) for view in found.queries])
-    torch.testing.assert_close(found.solution.answer(), expected, rtol=0, atol=1e-6)
-    assert found.solution.valid.all() and found.solution.poses.shape == (2, 1, 3)
+    for pair in found:
+        expected = relative_pose(poses["011"], poses[pair.query])
+        torch.testing.assert_close(pair.pose, expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -280,8 +280,8 @@ def test_the_published_results_with_zero123_xl(published, capsys):
             if "gt_rel_sph" in entry:
                 name = next(name for name in omni3d_objects(published) if name in file.name)
                 cameras = omni3d_cameras(published, name)
-                row = list(zip(found.objects, found.queries, strict=True)).index((name, view))
-                truth = relative_pose(view_pose(cameras[found.references[row]]), view_pose(cameras[view]))
+                (pair,) = [each for each in found if (each.object, each.query) == (name, view)]
+                truth = relative_pose(view_pose(cameras[pair.reference]), view_pose(cameras[view]))
                 polar, azimuth, _ = entry["gt_rel_sph"]
                 assert truth[:2].tolist() == pytest.approx([-polar, azimuth], abs=1e-6)
     assert idpose_results.main([str(published), str(published)]) == 0

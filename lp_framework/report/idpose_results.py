@@ -13,9 +13,8 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
@@ -26,21 +25,19 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import PoseMetrics
 from lp_framework.evaluation.tables import summary_rows, terminal_table
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, translation_error, view_pose
-from lp_framework.solvers.base import Cost, Solution
 
 
-@dataclass(frozen=True)
-class IDPoseResults:
-    """P pairs of views: their object, reference and query by name, and the solution, of one start a pair."""
+class IDPosePair(NamedTuple):
+    """A pair of an object's views by name, and the relative pose `[3]` (radians, Zero123's units; float64) found."""
 
-    objects: list[str]
-    references: list[str]
-    queries: list[str]
-    solution: Solution
+    object: str
+    reference: str
+    query: str
+    pose: Tensor
 
 
-def read_idpose_results(folder: str | Path, objects: Sequence[str]) -> IDPoseResults:
-    """The results for `objects` in a folder. Energies are not on record: all are 0.
+def read_idpose_results(folder: str | Path, objects: Sequence[str]) -> list[IDPosePair]:
+    """The results for `objects` in a folder.
 
     Raises `UserError` naming the file that is malformed or about no known object.
     """
@@ -48,19 +45,10 @@ def read_idpose_results(folder: str | Path, objects: Sequence[str]) -> IDPoseRes
     files = sorted([*folder.glob("*.json"), *folder.glob("*/pose.json")])
     if not files:
         raise UserError(f"{folder}: holds no results of ID-Pose; looked for {folder}/*/pose.json and {folder}/*.json")
-    rows = [row for file in files for row in _pairs(file, objects)]
-    poses = torch.stack([row[3] for row in rows])[:, None]
-    solution = Solution(
-        poses=poses,
-        energies=torch.zeros(len(rows), 1),
-        valid=poses.isfinite().all(-1),
-        chosen=torch.zeros(len(rows), dtype=torch.int64),
-        cost=Cost(network_passes=0, seconds=0.0),
-    )
-    return IDPoseResults([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows], solution)
+    return [pair for file in files for pair in _pairs(file, objects)]
 
 
-def _pairs(file: Path, objects: Sequence[str]) -> list[tuple[str, str, str, Tensor]]:
+def _pairs(file: Path, objects: Sequence[str]) -> list[IDPosePair]:
     label = file.parent.name if file.name == "pose.json" else file.stem
     try:
         content = json.loads(file.read_bytes())
@@ -76,12 +64,12 @@ def _pairs(file: Path, objects: Sequence[str]) -> list[tuple[str, str, str, Tens
         ) from error
     if not found or any(pose.shape != (3,) for pose in found.values()):
         raise UserError(f"{file}: needs a rel_sph of three numbers for each other view")
-    named = [name for name in objects if f"_{label}".find(f"_{name}_{anchor}+") >= 0]
+    named = [name for name in objects if f"_{name}_{anchor}+" in f"_{label}"]
     if not named:
         raise UserError(f"{file}: its name tells none of the objects {', '.join(objects)}")
     # Polar angles are counted from the pole, latitudes from the equator.
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-    return [(max(named, key=len), anchor, view, pose * flip) for view, pose in found.items()]
+    return [IDPosePair(max(named, key=len), anchor, view, pose * flip) for view, pose in found.items()]
 
 
 def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
@@ -90,30 +78,29 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
     Of the scene, scaled so that the reference stands at 1.85; the true camera is the one on record.
     """
     names = omni3d_objects(views)
-    found = read_idpose_results(results, names)
-    cameras = {name: omni3d_cameras(views, name) for name in set(found.objects)}
-    pairs = list(zip(found.objects, found.references, found.queries, strict=True))
-    for name, *both in pairs:
+    pairs = read_idpose_results(results, names)
+    cameras = {name: omni3d_cameras(views, name) for name in {pair.object for pair in pairs}}
+    for name, *both, _ in pairs:
         for view in both:
             if view not in cameras[name]:
                 raise UserError(
                     f"{results}: has view {view} of '{name}', but {views}/{name}/poses/{view}.npy is missing"
                 )
-    reference = torch.stack([cameras[name][view] for name, view, _ in pairs])
-    query = torch.stack([cameras[name][view] for name, _, view in pairs])
+    reference = torch.stack([cameras[pair.object][pair.reference] for pair in pairs])
+    query = torch.stack([cameras[pair.object][pair.query] for pair in pairs])
     scale = RADIUS / reference[:, :3, 3].norm(dim=-1)
     for camera in (reference, query):
         camera[:, :3, 3] *= scale[:, None]
-    predicted = camera_to_world(apply_relative_pose(view_pose(reference)[:, None], found.solution.poses))
-    true = query[:, None].expand_as(predicted)
+    poses = torch.stack([pair.pose for pair in pairs])
+    predicted = camera_to_world(apply_relative_pose(view_pose(reference), poses))
     metrics = PoseMetrics(names, ["unlabelled"] * len(names), [None] * len(names))
     metrics.update(
         torch.arange(len(pairs)),
-        torch.tensor([names.index(name) for name in found.objects]),
-        rotation_error(predicted, true),
-        translation_error(predicted, true),
-        found.solution.chosen,
-        found.solution.answer(),
+        torch.tensor([names.index(pair.object) for pair in pairs]),
+        rotation_error(predicted, query)[:, None],
+        translation_error(predicted, query)[:, None],
+        torch.zeros(len(pairs), dtype=torch.int64),
+        poses,
     )
     result: dict[str, Any] = metrics.compute()
     return result
@@ -129,10 +116,8 @@ def main(arguments: Sequence[str]) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    rows = [
-        (f"ID-Pose, {result['pairs']} pairs" if name == "all objects" else name, row)
-        for name, row in summary_rows(result)
-    ]
+    rows = summary_rows(result)
+    rows[0] = (f"ID-Pose, {result['pairs']} pairs", rows[0][1])
     Console(width=120).print(terminal_table(f"{arguments[0]} (units: reference radius {RADIUS})", rows))
     return 0
 

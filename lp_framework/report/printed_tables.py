@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +13,8 @@ from rich.text import Text
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
-from lp_framework.report.paper import PaperRow
 from lp_framework.report.runs import COSTS
-from lp_framework.report.sweep_tables import Row, Spread, SweepTable, in_order
+from lp_framework.report.sweep_tables import Spread, SweepTable, in_order
 
 METRICS = [*COLUMNS, *ERRORS, *COSTS]
 HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passes"], strict=True))
@@ -147,14 +146,13 @@ def _down(table: SweepTable) -> Layout:
     """A line a row, the metrics across."""
     labels = [*map(heading, table.columns), "runs"]
     lines = []
-    for row, paper in _beside(table):
+    for row, paper in table.beside_paper():
         if row is not None:
             cells = [shown(row.settings.get(key)) for key in table.columns] + [str(len(row.seeds))]
-            lines.append(_ours(cells, PRINTED, [row.metrics.get(name) for name in PRINTED]))
+            lines.append(_line(cells, PRINTED, [row.metrics.get(name) for name in PRINTED]))
         for each in paper:
-            label = [f"paper: {each.label}"] + [""] * len(table.columns)
-            values = [number(name, each.metrics[name]) if name in each.metrics else "-" for name in PRINTED]
-            lines.append(Line(label + values, [""] * (len(label) + len(values)), True))
+            cells = [f"paper: {each.label}"] + [""] * len(table.columns)
+            lines.append(_line(cells, PRINTED, [_alone(each.metrics.get(name)) for name in PRINTED], paper=True))
     return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
 
 
@@ -164,58 +162,32 @@ def _across(table: SweepTable, axis: str) -> Layout:
     values = sorted({row.settings.get(axis) for row in table.rows}, key=in_order)
     labels = [*map(heading, others), "runs", "metric"]
     lines = []
-    for settings in _without(table, axis):
-        rows = {row.settings.get(axis): row for row in table.rows if _same(row.settings, settings, others)}
-        paper = {
-            value: table.paper.matching({**settings, axis: value}) if table.paper is not None else []
-            for value in values
-        }
-        runs = sorted({len(row.seeds) for row in rows.values()})
+    for group in table.apart_from(axis):
+        settings = group[0].settings
+        rows = {row.settings.get(axis): row.metrics for row in group}
+        runs = "-".join(map(str, sorted({len(row.seeds) for row in group})))
+        papers = [[row.metrics for row in table.papers({**settings, axis: value})] for value in values]
         for name in ACROSS[axis]:
-            cells = [shown(settings.get(key)) for key in others] + ["-".join(map(str, runs))]
-            cells += [HEADINGS.get(name, name)]
-            lines.append(_ours(cells, [name] * len(values), [
-                rows[value].metrics.get(name) if value in rows else None for value in values]))  # fmt: skip
-            theirs = [
-                next((row.metrics[name] for row in paper[value] if name in row.metrics), None) for value in values
-            ]
+            names, told = [name] * len(values), HEADINGS.get(name, name)
+            cells = [*(shown(settings.get(key)) for key in others), runs, told]
+            lines.append(_line(cells, names, [rows.get(value, {}).get(name) for value in values]))
+            theirs = [_alone(next((each[name] for each in paper if name in each), None)) for paper in papers]
             if any(value is not None for value in theirs):
-                cells = ["paper", *[""] * (len(labels) - 2), HEADINGS.get(name, name)]
-                cells += ["-" if value is None else number(name, value) for value in theirs]
-                lines.append(Line(cells, [""] * len(cells), True))
+                lines.append(_line(["paper", *[""] * (len(labels) - 2), told], names, theirs, paper=True))
     return Layout([*labels, *(f"{heading(axis)}={shown(value)}" for value in values)], len(labels), lines)
 
 
-def _beside(table: SweepTable) -> list[tuple[Row | None, list[PaperRow]]]:
-    """Every row with the paper's rows to compare it with; last, without a row of ours, the rest of the paper's."""
-    paper = table.paper
-    if paper is None:
-        return [(row, []) for row in table.rows]
-    pairs: list[tuple[Row | None, list[PaperRow]]] = [(row, paper.matching(row.settings)) for row in table.rows]
-    met = [each for _, rows in pairs for each in rows]
-    return [*pairs, (None, [each for each in paper.rows if each not in met])]
-
-
-def _without(table: SweepTable, axis: str) -> list[dict[str, Any]]:
-    """What is set in the rows apart from `axis`, each once."""
-    found: list[dict[str, Any]] = []
-    for row in table.rows:
-        settings = {key: value for key, value in row.settings.items() if key != axis}
-        if settings not in found:
-            found.append(settings)
-    return found
-
-
-def _same(settings: Mapping[str, Any], others: Mapping[str, Any], keys: Sequence[str]) -> bool:
-    return all(settings.get(key) == others.get(key) for key in keys)
-
-
-def _ours(labels: Sequence[str], names: Sequence[str], values: Sequence[Spread | None]) -> Line:
+def _line(labels: Sequence[str], names: Sequence[str], values: Sequence[Spread | None], paper: bool = False) -> Line:
     cells, spreads = list(labels), [""] * len(labels)
     for name, value in zip(names, values, strict=True):
         cells.append("-" if value is None else number(name, value.mean))
         spreads.append("" if value is None or value.std is None else number(name, value.std))
-    return Line(cells, spreads, False)
+    return Line(cells, spreads, paper)
+
+
+def _alone(value: float | None) -> Spread | None:
+    """A number of the paper, which has no spread."""
+    return None if value is None else Spread(value, None)
 
 
 def _rounded(value: Spread | None) -> tuple[float | str | None, float | None]:

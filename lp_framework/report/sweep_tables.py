@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from lp_framework.report.paper import PaperTable, paper_table
+from lp_framework.report.paper import PaperRow, PaperTable, paper_table
 from lp_framework.report.runs import LeftOut, Run, checkpoint_names
 
 Objects = Literal["unique_answer", "all"]
@@ -33,6 +33,16 @@ class Row:
     folders: Sequence[Path]
     pairs: int
 
+    @property
+    def means(self) -> dict[str, float]:
+        """The means of the metrics."""
+        return {name: value.mean for name, value in self.metrics.items()}
+
+    @property
+    def stds(self) -> dict[str, float]:
+        """Their standard deviations, NaN where there is none."""
+        return {name: math.nan if value.std is None else value.std for name, value in self.metrics.items()}
+
 
 @dataclass(frozen=True)
 class SweepTable:
@@ -47,6 +57,25 @@ class SweepTable:
     rows: Sequence[Row]
     common: Mapping[str, Any]
     paper: PaperTable | None
+
+    def apart_from(self, axis: str) -> list[list[Row]]:
+        """The rows in groups, in each of which they differ in nothing but the setting `axis`."""
+        groups: dict[str, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(
+                json.dumps({key: row.settings.get(key) for key in self.columns if key != axis}), []
+            ).append(row)
+        return list(groups.values())
+
+    def papers(self, settings: Mapping[str, Any]) -> list[PaperRow]:
+        """The paper's rows to compare a run of these settings with."""
+        return [] if self.paper is None else self.paper.matching(settings)
+
+    def beside_paper(self) -> list[tuple[Row | None, list[PaperRow]]]:
+        """Every row with the paper's to compare it with; last, without a row of ours, the rest of the paper's."""
+        pairs: list[tuple[Row | None, list[PaperRow]]] = [(row, self.papers(row.settings)) for row in self.rows]
+        met = [each for _, rows in pairs for each in rows]
+        return [*pairs, (None, [each for each in (self.paper.rows if self.paper else []) if each not in met])]
 
 
 def sweep_tables(runs: Sequence[Run], objects: Objects) -> tuple[list[SweepTable], list[LeftOut]]:
