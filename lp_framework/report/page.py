@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
+
+from plotly.offline import get_plotlyjs
 
 from lp_framework.evaluation.tables import write_text
 from lp_framework.report.estimates import estimate_part
@@ -28,13 +31,12 @@ HEADINGS: Mapping[Kind, str] = {
 
 
 class Listed(NamedTuple):
-    """A run on the page of a set, and its content where there is room for it: at `place`."""
+    """A run on the page of a set; `content` is all of it (HTML), None where there is no room for it."""
 
     folder: Path
     kind: Kind
     part: RunPart
-    place: str | None
-    content: str
+    content: str | None
 
 
 def write_run_page(folder: Path, kind: Kind) -> Path:
@@ -48,62 +50,41 @@ def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequ
         folder, kind = runs[0]
         part = PARTS[kind](folder)
         *sections, configuration = part.sections
-        body = render("run.html.j2", numbers=part.numbers, sections=[*sections, *above, configuration])
-        return _write(path, part.title, part.subtitle, body)
-    listed = _listed(runs)
-    tables = [
-        Section(HEADINGS[kind], _table(HEADINGS[kind], [run for run in listed if run.kind == kind]))
-        for kind in dict.fromkeys(run.kind for run in listed)
-    ]
-    opened = [run for run in listed if run.place is not None]
-    content = render("opened.html.j2", runs=opened, left_out=len(runs) - len(opened))
-    sections = [*above, *tables, Section("Run by run", content)]
-    return _write(path, "Report", f"{len(runs)} runs", render("run.html.j2", numbers={}, sections=sections))
-
-
-def _listed(runs: Sequence[tuple[Path, Kind]]) -> list[Listed]:
-    """The runs with their parts; the content of those that fit."""
-    found: list[Listed] = []
-    size = opened = 0
+        return _write(path, replace(part, sections=[*sections, *above, configuration]))
+    listed: list[Listed] = []
+    size = 0
     for folder, kind in runs:
         part = PARTS[kind](folder)
-        content = render("note.html.j2", text=part.subtitle) + render(
-            "run.html.j2", numbers=part.numbers, sections=part.sections
-        )
+        content = render("run.html.j2", part=part)
         fits = size + len(content) <= LARGEST
-        found.append(Listed(folder, kind, part, f"run-{opened}" if fits else None, content if fits else ""))
-        size, opened = size + fits * len(content), opened + fits
-    return found
+        size += len(content) if fits else 0
+        listed.append(Listed(folder, kind, part, content if fits else None))
+    sections = [*above]
+    for kind in dict.fromkeys(kind for _, kind in runs):
+        rows = [(number, run) for number, run in enumerate(listed) if run.kind == kind]
+        keys = list(dict.fromkeys(key for _, run in rows for key in run.part.numbers))
+        sections.append(Section(HEADINGS[kind], render("runs.html.j2", caption=HEADINGS[kind], keys=keys, rows=rows)))
+    sections.append(Section("Run by run", render("opened.html.j2", runs=listed)))
+    return _write(path, RunPart("Report", f"{len(runs)} runs", {}, sections))
 
 
-def _table(caption: str, runs: Sequence[Listed]) -> str:
-    keys = list(dict.fromkeys(key for run in runs for key in run.part.numbers))
-    return render("runs.html.j2", caption=caption, keys=keys, runs=runs)
-
-
-def _write(path: Path, title: str, subtitle: str, body: str) -> Path:
+def _write(path: Path, part: RunPart) -> Path:
     """Write the page whole or not at all."""
+    templates = resources.files("lp_framework.report") / "templates"
+    drawn = any("data-figure=" in section.content for section in part.sections)
     text = render(
         "page.html.j2",
-        title=title,
-        subtitle=subtitle,
-        body=body,
-        style=_file("page.css"),
-        script=_file("page.js"),
-        plotly=_plotly() if "data-figure=" in body else "",
+        part=part,
+        style=(templates / "page.css").read_text(encoding="utf-8"),
+        script=(templates / "page.js").read_text(encoding="utf-8"),
+        plotly=_plotly() if drawn else "",
         version=importlib.metadata.version("lp_framework"),
     )
     write_text(path, text)
     return path
 
 
-def _file(name: str) -> str:
-    return (resources.files("lp_framework.report") / "templates" / name).read_text(encoding="utf-8")
-
-
 @cache
 def _plotly() -> str:
     """plotly.js, packed: a third of its size, so that every run of a sweep can have a page."""
-    from plotly.offline import get_plotlyjs  # takes a moment, and only pages need it
-
     return packed(get_plotlyjs())

@@ -73,24 +73,8 @@ def paper_tables() -> tuple[PaperTable, ...]:
 
 
 def _read(name: str, content: Mapping[str, Any]) -> PaperTable:
-    columns = content["columns"]
-    rows = [
-        PaperRow(
-            row["label"],
-            row["settings"],
-            row.get("data"),
-            {key: value for key, value in zip(columns, row["values"], strict=True) if value is not None},
-        )
-        for row in content["rows"]
-    ]
-    texts = {key: " ".join(content[key].split()) for key in ("title", "source", "caption")}
-    notes = [" ".join(note.split()) for note in content["notes"]]
-    return PaperTable(
-        name=name,
-        **texts,
-        experiments=content["experiments"],
-        notes=notes,
-        settings=content["settings"],
-        columns=columns,
-        rows=rows,
-    )
+    rows = []
+    for row in content["rows"]:
+        values = {key: value for key, value in zip(content["columns"], row["values"], strict=True) if value is not None}
+        rows.append(PaperRow(row["label"], row["settings"], row.get("data"), values))
+    return PaperTable(name, **{**content, "rows": rows})

@@ -69,7 +69,7 @@ def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
         error, share = cumulative(values, 180.0)
         kept = np.unique(np.linspace(0, len(error) - 1, ERROR_POINTS).round().astype(int))
         figure.add_scatter(
-            x=_numbers(np.sqrt(error[kept])), y=_numbers(share[kept], 5), customdata=_numbers(error[kept]),
+            x=_numbers(np.sqrt(error[kept])), y=_numbers(share[kept]), customdata=_numbers(error[kept]),
             name=f"{name} ({len(values)} pairs)", mode="lines",
             line={"color": f"var(--{name})", "width": 2.5, "shape": "hv"},
             hovertemplate="%{y:.1%} of pairs within %{customdata:.1f}°<extra>%{fullData.name}</extra>",
@@ -172,7 +172,7 @@ def surface_plot(example: Example) -> go.Figure:
         place, along = _raised(landscape, _on_map), _raised(landscape, _along_map)
         if example.truth is not None:
             pole = np.repeat(place(example.truth[None]), 2, axis=0)
-            pole[1, 2] = landscape.energy.max().item()
+            pole[1, 2] = np.nanmax(landscape.energy)
             figure.add_trace(_line(pole, TRUTH, 5, **only))
             _add_marks(figure, pole[1:], "true pose", TRUTH, 8, symbol="diamond", **only)
         _add_trails(figure, example, along, (WHITE, ANSWER), (3, 8), **only)
@@ -193,7 +193,7 @@ def pair_cameras_plot(example: Example) -> go.Figure:
     for name, landscape in example.landscapes.items():
         latitude, longitude, energy = closed(landscape)
         ball = _ball(np.radians(latitude) + reference[0], np.radians(longitude) + reference[1], GLOBE)
-        shade = {"intensity": _numbers(energy.ravel(), 5), "colorscale": RELIEF, "showscale": False}
+        shade = {"intensity": _numbers(energy.ravel()), "colorscale": RELIEF, "showscale": False}
         figure.add_mesh3d(**ball, **shade, **_of(example, name), **look)
     for pose, view, colour in ((reference, example.reference, REFERENCE), (query, example.query, TRUTH)):
         if pose is not None:
@@ -233,7 +233,7 @@ def _relief(name: str, landscape: Landscape) -> dict[str, Any]:
     """A landscape for a contour or a surface."""
     latitude, longitude, energy = closed(landscape)
     hover = f"{PLACE}: %{{z:.4g}}<extra>{name}</extra>"
-    values = {"x": _numbers(longitude), "y": _numbers(latitude), "z": _numbers(energy, 5)}
+    values = {"x": _numbers(longitude), "y": _numbers(latitude), "z": _numbers(energy)}
     return {**values, "colorscale": RELIEF, "hovertemplate": hover}
 
 
@@ -280,7 +280,7 @@ def _raised(landscape: Landscape, place: Points) -> Points:
     """`place`, with the height of the landscape there, a little above it."""
     latitude, longitude, energy = closed(landscape)
     height = RegularGridInterpolator((latitude, longitude), energy, bounds_error=False)
-    lift = 0.03 * (np.ptp(energy) or 1.0)
+    lift = 0.03 * (np.nanmax(energy) - np.nanmin(energy) or 1.0)
 
     def raised(poses: NDArray) -> NDArray:
         points = place(poses)
@@ -395,18 +395,21 @@ def _add_marks(
 
 
 def _trace(points: NDArray, **more: Any) -> go.Scatter | go.Scatter3d:
-    """Points `[T, 2]` on the map, or `[T, 3]` in space."""
+    """A trace of points `[T, 2]` on the map, or `[T, 3]` in space."""
     return (go.Scatter if points.shape[1] == 2 else go.Scatter3d)(**_xyz(points), **more)
 
 
 def _xyz(points: NDArray) -> dict[str, list[float]]:
-    return dict(zip("xyz", _numbers(points.T), strict=False))
+    return {name: _numbers(values) for name, values in zip("xyz", points.T, strict=False)}
 
 
 def _thinned(curve: Curve) -> dict[str, list[float]]:
+    """A curve with at most `LOSS_POINTS` points, to five digits."""
     every = -(-len(curve.step) // LOSS_POINTS)
     return {"x": curve.step[::every].tolist(), "y": [float(f"{value:.5g}") for value in curve.value[::every]]}
 
 
-def _numbers(values: NDArray, digits: int = 3) -> Any:
-    return np.round(values, digits).tolist()
+def _numbers(values: NDArray) -> Any:
+    """Values as lists, to five digits of the largest."""
+    largest = np.abs(np.nan_to_num(values, posinf=0, neginf=0)).max(initial=0)
+    return np.round(values, 4 - math.floor(math.log10(largest or 1))).tolist()
