@@ -532,6 +532,19 @@ def test_a_page_is_drawn_in_light_and_dark_on_desks_and_phones(scheme, width, op
 
 
 @with_browser
+@pytest.mark.parametrize(("width", "whole"), [(1280, True), (390, False)])
+def test_a_table_shows_all_of_its_columns_or_scrolls_in_its_own_box(width, whole, opened, tmp_path):
+    page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"), "light", width)
+    for name in ("summary", "objects"):
+        region = page.get_by_role("region", name=name)
+        assert region.evaluate("(box) => box.scrollWidth <= box.clientWidth") == whole
+        region.evaluate("(box) => { box.scrollLeft = box.scrollWidth; }")
+        last = region.locator("thead th").last
+        right, edge = (each.evaluate("(each) => each.getBoundingClientRect().right") for each in (last, region))
+        assert right <= edge + 1 <= width + 1
+
+
+@with_browser
 @pytest.mark.parametrize("kind", ["train", "estimate", "landscape"])
 def test_pages_of_the_other_commands_are_drawn(kind, opened, tmp_path):
     folder = WRITERS[kind](tmp_path / "run")

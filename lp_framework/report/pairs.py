@@ -7,14 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lp_framework.evaluation.examples import Example
+from lp_framework.evaluation.landscape import LandscapeMinimum
 from lp_framework.report.parts import packed
 from lp_framework.report.plots import frame_steps, map_plot, pair_cameras_plot, surface_plot
 
 LARGEST = 4_000_000  # letters that the plots of one run's pairs may take; the last ones are left out beyond it
 VALLEYS = 4  # of a landscape, told by their places
+TURN, MINUS = 2 * math.pi, "\N{MINUS SIGN}"
 
 
 @dataclass(frozen=True)
@@ -51,30 +54,26 @@ def pairs(examples: Sequence[Example]) -> dict[str, Any]:
 def told(example: Example) -> dict[str, str]:
     """What is to be said of a pair in words, by its name."""
     rotation, translation = (each[example.chosen] for each in (example.rotation_errors, example.translation_errors))
-    off = [f"{rotation:.1f}°"] * math.isfinite(rotation) + [f"{translation:.2f}"] * math.isfinite(translation)
-    answer = _pose(example.ends[example.chosen]) + (f": off by {' and '.join(off)}" if off else "")
+    answer = _pose(example.ends[example.chosen])
+    if math.isfinite(rotation):
+        answer += f": off by {rotation:.1f}°" + (f" and {translation:.2f}" if math.isfinite(translation) else "")
     truth = {} if example.truth is None else {"true relative pose": _pose(example.truth)}
-    valleys = {}
-    for name, landscape in example.landscapes.items():
-        minima = landscape.minima()
-        places = "; ".join(f"{_angle(each.latitude)}, {_turned(each.longitude)}" for each in minima[:VALLEYS])
-        count = "one valley, at" if len(minima) == 1 else f"{len(minima)} valleys, the deepest first:"
-        valleys[name] = f"{count} {places}{'; …' if len(minima) > VALLEYS else ''}" if minima else "no valley"
+    valleys = {name: _valleys(landscape.minima()) for name, landscape in example.landscapes.items()}
     return {"pair": example.reason, **truth, "answer": answer, **valleys}
+
+
+def _valleys(minima: Sequence[LandscapeMinimum]) -> str:
+    places = "; ".join(f"{_angle(each.latitude)}, {_angle(each.longitude % TURN)}" for each in minima[:VALLEYS])
+    count = "one valley, at" if len(minima) == 1 else f"{len(minima)} valleys, the deepest first:"
+    return f"{count} {places}{'; …' if len(minima) > VALLEYS else ''}" if minima else "no valley"
 
 
 def _pose(pose: NDArray) -> str:
     latitude, longitude, radius = pose
-    return f"latitude {_angle(latitude)}, longitude {_turned(longitude)}, radius {_signed(radius, 2)}"
-
-
-def _turned(angle: float) -> str:
-    return _angle(angle % (2 * math.pi))
+    if not np.isfinite(pose).all():
+        return "none"
+    return f"latitude {_angle(latitude)}, longitude {_angle(longitude % TURN)}, radius {radius:.2f}".replace("-", MINUS)
 
 
 def _angle(radians: float) -> str:
-    return f"{_signed(math.degrees(radians), 1)}°" if math.isfinite(radians) else "none"
-
-
-def _signed(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") if math.isfinite(value) else "none"
+    return f"{math.degrees(radians):.1f}°".replace("-", MINUS)

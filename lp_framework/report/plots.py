@@ -145,11 +145,11 @@ def map_plot(example: Example) -> go.Figure:
     others, halo = (DARK, WHITE) if example.landscapes else (OTHERS, HALO)
     if example.starts is not None:
         _add_marks(figure, _on_map(example.starts), "start", WHITE, 8, line={"color": DARK, "width": 1.6})
+    _add_trails(figure, example, _along_map, (halo, halo), (3.2, 5))
+    _add_trails(figure, example, _along_map, (others, ANSWER), (1.4, 2.8))
     if example.truth is not None:
         edge = {"color": "#222222", "width": 1.2}
         _add_marks(figure, _on_map(example.truth[None]), "true pose", TRUTH, 19, symbol="star", line=edge)
-    _add_trails(figure, example, _along_map, (halo, halo), (3.2, 5))
-    _add_trails(figure, example, _along_map, (others, ANSWER), (1.4, 2.8))
     edge = {"color": WHITE, "width": 1.2}
     return _framed(figure, example, _add_moving(figure, example, _on_map, others, (8, 12), line=edge))
 
