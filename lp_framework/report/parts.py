@@ -83,12 +83,7 @@ def tried(value: Callable[[], T], otherwise: T) -> T:
 
 def read_json(file: Path) -> dict[str, Any]:
     """An object of JSON; `UserError` where it is missing or damaged."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"there is no {file.name}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{file.name} is damaged ({error})") from error
+    content = _read(file, json.loads)
     if not isinstance(content, dict):
         raise UserError(f"{file.name} is damaged (it holds no object)")
     return content
@@ -96,12 +91,15 @@ def read_json(file: Path) -> dict[str, Any]:
 
 def read_rows(file: Path) -> list[dict[str, str]]:
     """The rows of a CSV file with a heading; `UserError` where it is missing or damaged."""
+    return _read(file, lambda text: list(csv.DictReader(io.StringIO(text, newline=""))))
+
+
+def _read(file: Path, parse: Callable[[str], T]) -> T:
     try:
-        with file.open(newline="", encoding="utf-8") as content:
-            return list(csv.DictReader(content))
+        return parse(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"there is no {file.name}") from None
-    except (OSError, ValueError, csv.Error) as error:
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
         raise UserError(f"{file.name} is damaged ({error})") from error
 
 
