@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import RESULT
-from lp_framework.report.parts import RunPart, configuration, packed, read_json, read_rows, section, tried, words
+from lp_framework.report.parts import RunPart, configuration, packed, read_json, read_rows, section, tried
 from lp_framework.report.plots import cameras_plot
 
 MOST_CAMERAS = 40

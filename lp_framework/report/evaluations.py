@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from lp_framework.analysis.examples import EXAMPLES, read_examples
+from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
-from lp_framework.evaluation.examples import EXAMPLES, read_examples
 from lp_framework.evaluation.tables import RESULT, summary_rows
 from lp_framework.report.pairs import pairs
 from lp_framework.report.parts import RunPart, configuration, packed, read_json, read_rows, section, tried
@@ -32,7 +33,7 @@ def evaluation_part(folder: Path) -> RunPart:
         numbers=tried(lambda: _numbers(result), {}),
         sections=[
             section("Summary", "summary", lambda: {"rows": summary_rows(result), "result": result}),
-            section("Pairs, failures first", "pairs", lambda: pairs(read_examples(folder / "pictures" / EXAMPLES))),
+            section("Pairs, failures first", "pairs", lambda: _pairs(folder, result)),
             section("Objects", "objects", lambda: _objects(result, read_rows(folder / "pairs.csv"))),
             section("Errors", "errors", lambda: _errors(read_rows(folder / "pairs.csv"))),
             configuration(folder, result),
@@ -44,7 +45,7 @@ def _titles(result: Mapping[str, Any]) -> tuple[str, str]:
     config = result["config"]
     settings = f"start={config['start']['name']}, seed {result['seed']}"
     return (
-        f"{config['solver']['name'].replace('_', ' ')} on {config['data']['name']}",
+        f"{words(config['solver']['name'])} on {config['data']['name']}",
         f"evaluation of {result['pairs']} pairs ({result['protocol']}), {settings}",
     )
 
@@ -59,6 +60,12 @@ def _numbers(result: Mapping[str, Any]) -> dict[str, str]:
         "pairs": str(result["pairs"]),
         "seconds a pair": f"{result['seconds_per_pair']:.3g}",
     }
+
+
+def _pairs(folder: Path, result: Mapping[str, Any]) -> dict[str, Any]:
+    if result["config"].get("pictures") is False:
+        raise UserError("the run was made with pictures=false")
+    return pairs(read_examples(folder / "pictures" / EXAMPLES))
 
 
 def _objects(result: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:

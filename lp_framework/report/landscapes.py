@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lp_framework.analysis.examples import EXAMPLES, read_examples
+from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
-from lp_framework.evaluation.examples import EXAMPLES, read_examples
 from lp_framework.report.pairs import pairs
-from lp_framework.report.parts import RunPart, configuration, read_json, section, tried, words
+from lp_framework.report.parts import RunPart, configuration, read_json, section, tried
 
 
 def landscape_part(folder: Path) -> RunPart:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lp_framework.evaluation.examples import Example
-from lp_framework.evaluation.landscape import LandscapeMinimum
+from lp_framework.analysis.landscapes import LandscapeMinimum
+from lp_framework.analysis.shown import ShownPair
 from lp_framework.report.parts import packed
 from lp_framework.report.plots import frame_steps, map_plot, pair_cameras_plot, surface_plot
 
@@ -24,13 +24,13 @@ TURN, MINUS = 2 * math.pi, "\N{MINUS SIGN}"
 class Pair:
     """A pair with its plots (packed, by kind), the steps that their frames show, and what is told of it."""
 
-    example: Example
+    example: ShownPair
     plots: Mapping[str, str]
     steps: Sequence[int]
     told: Mapping[str, str]
 
 
-def pairs(examples: Sequence[Example]) -> dict[str, Any]:
+def pairs(examples: Sequence[ShownPair]) -> dict[str, Any]:
     """What the template `pairs` shows of examples."""
     shown: list[Pair] = []
     size = 0
@@ -51,10 +51,11 @@ def pairs(examples: Sequence[Example]) -> dict[str, Any]:
     }
 
 
-def told(example: Example) -> dict[str, str]:
+def told(example: ShownPair) -> dict[str, str]:
     """What is to be said of a pair in words, by its name."""
-    rotation, translation = (each[example.chosen] for each in (example.rotation_errors, example.translation_errors))
-    answer = _pose(example.ends[example.chosen])
+    chosen = example.chosen or 0  # a pair that was saved has one
+    rotation, translation = example.rotation_errors[chosen], example.translation_errors[chosen]
+    answer = _pose(example.ends[chosen])
     if math.isfinite(rotation):
         answer += f": off by {rotation:.1f}°" + (f" and {translation:.2f}" if math.isfinite(translation) else "")
     truth = {} if example.truth is None else {"true relative pose": _pose(example.truth)}

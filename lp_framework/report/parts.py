@@ -18,6 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from numpy.typing import NDArray
 from PIL import Image
 
+from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
@@ -128,11 +129,6 @@ def metric(metrics: Mapping[str, float | None], key: str) -> str:
         return "-"
     value = metrics[key]
     return number(key, math.inf if value is None else value)
-
-
-def words(name: str) -> str:
-    """The name of an object or a class in words."""
-    return name.replace("_", " ")
 
 
 _ENVIRONMENT = Environment(

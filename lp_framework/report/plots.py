@@ -19,15 +19,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.interpolate import RegularGridInterpolator
 
-from lp_framework.data.photographs import FIELD_OF_VIEW_DEGREES
-from lp_framework.evaluation.examples import Example
-from lp_framework.evaluation.landscape import Landscape
+from lp_framework.analysis.landscapes import Landscape
+from lp_framework.analysis.shown import ShownPair
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.geometry import camera_to_world
-from lp_framework.viz.cameras import image_plane, ring
+from lp_framework.viz.cameras import ROUND, SPOKES, image_plane
 from lp_framework.viz.errors_plot import cumulative
-from lp_framework.viz.fields import broken_at_seam
-from lp_framework.viz.landscape import RELIEF, closed
+from lp_framework.viz.maps import RELIEF, broken_at_seam, closed
 from lp_framework.viz.training import LOSSES, Curve, running_mean
 
 INK, MUTED, LINE, SURFACE, HALO, TRUTH, ANSWER, OTHERS, REFERENCE, GREY = (
@@ -119,15 +118,15 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray]) -> go.Figure:
 # ---------------------------------------------------------------- a pair
 
 
-def frame_steps(example: Example) -> list[int]:
+def frame_steps(pair: ShownPair) -> list[int]:
     """The steps of the solver that the frames of a pair show, the last one among them."""
-    steps: list[int] = np.unique(np.linspace(0, _ways(example).shape[1] - 1, FRAMES).round().astype(int)).tolist()
+    steps: list[int] = np.unique(np.linspace(0, _ways(pair).shape[1] - 1, FRAMES).round().astype(int)).tolist()
     return steps
 
 
-def map_plot(example: Example) -> go.Figure:
+def map_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes from above (degrees), and the ways of all starts over them."""
-    ends = [pose[0] for pose in (example.truth, example.ends[example.chosen]) if pose is not None]
+    ends = [pose[0] for pose in (pair.truth, _parts(pair)[1][0, -1]) if pose is not None]
     limit = max(60.0, *(abs(math.degrees(each)) + 5 for each in np.nan_to_num(ends)))
     angle = {"ticksuffix": "°", "zeroline": False}
     figure = _figure(
@@ -136,25 +135,25 @@ def map_plot(example: Example) -> go.Figure:
     )
     bar = {"orientation": "h", "thickness": 8, "xpad": 0, "ypad": 6, "y": 1.0, "yanchor": "bottom", "outlinewidth": 0,
            "tickfont": {"size": 10}, "nticks": 6}  # fmt: skip
-    for name, landscape in example.landscapes.items():
+    for name, landscape in pair.landscapes.items():
         figure.add_contour(
-            **_relief(name, landscape), **_of(example, name), ncontours=14, contours={"coloring": "heatmap"},
+            **_relief(name, landscape), **_of(pair, name), ncontours=14, contours={"coloring": "heatmap"},
             line={"color": "rgba(255,255,255,0.35)", "width": 0.7},
             colorbar={**bar, "title": {"text": name, "side": "top", "font": {"size": 11}}},
         )  # fmt: skip
-    others, halo = (DARK, WHITE) if example.landscapes else (OTHERS, HALO)
-    if example.starts is not None:
-        _add_marks(figure, _on_map(example.starts), "start", WHITE, 8, line={"color": DARK, "width": 1.6})
-    _add_trails(figure, example, _along_map, (halo, halo), (3.2, 5))
-    _add_trails(figure, example, _along_map, (others, ANSWER), (1.4, 2.8))
-    if example.truth is not None:
+    others, halo = (DARK, WHITE) if pair.landscapes else (OTHERS, HALO)
+    if pair.starts is not None:
+        _add_marks(figure, _on_map(pair.starts), "start", WHITE, 8, line={"color": DARK, "width": 1.6})
+    _add_trails(figure, pair, _along_map, (halo, halo), (3.2, 5))
+    _add_trails(figure, pair, _along_map, (others, ANSWER), (1.4, 2.8))
+    if pair.truth is not None:
         edge = {"color": "#222222", "width": 1.2}
-        _add_marks(figure, _on_map(example.truth[None]), "true pose", TRUTH, 19, symbol="star", line=edge)
+        _add_marks(figure, _on_map(pair.truth[None]), "true pose", TRUTH, 19, symbol="star", line=edge)
     edge = {"color": WHITE, "width": 1.2}
-    return _framed(figure, example, _add_moving(figure, example, _on_map, others, (8, 12), line=edge))
+    return _framed(figure, pair, _add_moving(figure, pair, _on_map, others, (8, 12), line=edge))
 
 
-def surface_plot(example: Example) -> go.Figure:
+def surface_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes as relief, with the ways of all starts on it; the truth is a pole."""
     angle = {"ticksuffix": "°", "showspikes": False}
     axes = {
@@ -165,37 +164,37 @@ def surface_plot(example: Example) -> go.Figure:
     eye, centre = {"x": -0.5, "y": -1.65, "z": 2.1}, {"x": 0, "y": 0, "z": -0.15}
     figure = _scene({"x": 1.7, "y": 1, "z": 0.65}, eye, centre, **axes)
     moving: list[Moving] = []
-    for name, landscape in example.landscapes.items():
-        only = _of(example, name)
+    for name, landscape in pair.landscapes.items():
+        only = _of(pair, name)
         light = {"ambient": 0.75, "diffuse": 0.5, "specular": 0.05}
         figure.add_surface(**_relief(name, landscape), **only, showscale=False, lighting=light)
         place, along = _raised(landscape, _on_map), _raised(landscape, _along_map)
-        if example.truth is not None:
-            pole = np.repeat(place(example.truth[None]), 2, axis=0)
+        if pair.truth is not None:
+            pole = np.repeat(place(pair.truth[None]), 2, axis=0)
             pole[1, 2] = np.nanmax(landscape.energy)
             figure.add_trace(_line(pole, TRUTH, 5, **only))
             _add_marks(figure, pole[1:], "true pose", TRUTH, 8, symbol="diamond", **only)
-        _add_trails(figure, example, along, (WHITE, ANSWER), (3, 8), **only)
-        moving += _add_moving(figure, example, place, DARK, (5, 7), line={"color": WHITE, "width": 1}, **only)
-    return _framed(figure, example, moving)
+        _add_trails(figure, pair, along, (WHITE, ANSWER), (3, 8), **only)
+        moving += _add_moving(figure, pair, place, DARK, (5, 7), line={"color": WHITE, "width": 1}, **only)
+    return _framed(figure, pair, moving)
 
 
-def pair_cameras_plot(example: Example) -> go.Figure:
+def pair_cameras_plot(pair: ShownPair) -> go.Figure:
     """The cameras of a pair around a globe that bears the landscapes: both with their images, and where the ways go."""
-    reference = example.reference.pose
+    reference = pair.reference.pose
     distance = 0.32 * reference[2]
-    query = None if example.truth is None else reference + example.truth
+    query = None if pair.truth is None else reference + pair.truth
     figure = _space(1.1 * max(reference[2], 0.0 if query is None else query[2]), reference[1])
     look: dict[str, Any] = {"lighting": {"ambient": 0.9, "diffuse": 0.3, "specular": 0}, "hoverinfo": "skip"}
-    if example.landscapes:  # the plain core fills the poles
+    if pair.landscapes:  # the plain core fills the poles
         core = np.linspace(-math.pi / 2, math.pi / 2, 13), np.linspace(0, 2 * math.pi, 31)
         figure.add_mesh3d(**_ball(*core, GLOBE - 0.02), color=LINE, **look)
-    for name, landscape in example.landscapes.items():
+    for name, landscape in pair.landscapes.items():
         latitude, longitude, energy = closed(landscape)
         ball = _ball(np.radians(latitude) + reference[0], np.radians(longitude) + reference[1], GLOBE)
         shade = {"intensity": _numbers(energy.ravel()), "colorscale": RELIEF, "showscale": False}
-        figure.add_mesh3d(**ball, **shade, **_of(example, name), **look)
-    for pose, view, colour in ((reference, example.reference, REFERENCE), (query, example.query, TRUTH)):
+        figure.add_mesh3d(**ball, **shade, **_of(pair, name), **look)
+    for pose, view, colour in ((reference, pair.reference, REFERENCE), (query, pair.query, TRUTH)):
         if pose is not None:
             frustum = _frustum(pose, distance)
             figure.add_traces([_image(frustum, view.image), _line(frustum[OUTLINE], colour, 5)])
@@ -206,27 +205,27 @@ def pair_cameras_plot(example: Example) -> go.Figure:
     def outline(poses: NDArray) -> NDArray:
         return _frustum(reference + poses[0], distance)[OUTLINE]
 
-    _, answer = _parts(example)
-    _add_trails(figure, example, centres, (OTHERS, ANSWER), (2, 5))
-    moving = _add_moving(figure, example, centres, OTHERS, (4, 6))
+    _, answer = _parts(pair)
+    _add_trails(figure, pair, centres, (OTHERS, ANSWER), (2, 5))
+    moving = _add_moving(figure, pair, centres, OTHERS, (4, 6))
     figure.add_trace(_line(outline(answer[:, -1]), ANSWER, 5))
-    return _framed(figure, example, [*moving, Moving(len(figure.data) - 1, answer, outline)])
+    return _framed(figure, pair, [*moving, Moving(len(figure.data) - 1, answer, outline)])
 
 
-def _ways(example: Example) -> NDArray:
+def _ways(pair: ShownPair) -> NDArray:
     """Trajectories `[N, S, 3]`; of solvers that keep none, where the starts ended, `[N, 1, 3]`."""
-    return example.ends[:, None] if example.trajectories is None else example.trajectories
+    return pair.ends[:, None] if pair.trajectories is None else pair.trajectories
 
 
-def _parts(example: Example) -> tuple[NDArray, NDArray]:
+def _parts(pair: ShownPair) -> tuple[NDArray, NDArray]:
     """The ways `[_, S, 3]` of the other starts, and of the answer."""
-    paths = _ways(example)
-    return np.delete(paths, example.chosen, axis=0), paths[[example.chosen]]
+    paths, chosen = _ways(pair), pair.chosen or 0  # a pair that was saved has one
+    return np.delete(paths, chosen, axis=0), paths[[chosen]]
 
 
-def _of(example: Example, landscape: str) -> dict[str, Any]:
+def _of(pair: ShownPair, landscape: str) -> dict[str, Any]:
     """What marks a trace as one of a landscape; the first one is shown."""
-    return {"meta": landscape, "visible": landscape == next(iter(example.landscapes))}
+    return {"meta": landscape, "visible": landscape == next(iter(pair.landscapes))}
 
 
 def _relief(name: str, landscape: Landscape) -> dict[str, Any]:
@@ -238,10 +237,10 @@ def _relief(name: str, landscape: Landscape) -> dict[str, Any]:
 
 
 def _add_trails(
-    figure: go.Figure, example: Example, along: Points, colours: Sequence[str], widths: Sequence[float], **more: Any
+    figure: go.Figure, pair: ShownPair, along: Points, colours: Sequence[str], widths: Sequence[float], **more: Any
 ) -> None:
     """Two traces of lines: the ways of the other starts, and the answer's."""
-    for paths, colour, width in zip(_parts(example), colours, widths, strict=True):
+    for paths, colour, width in zip(_parts(pair), colours, widths, strict=True):
         known = [path[np.isfinite(path).all(axis=-1)] for path in paths]
         points = [np.pad(along(path), ((0, 1), (0, 0)), constant_values=np.nan) for path in known if len(path)]
         if points:
@@ -249,19 +248,19 @@ def _add_trails(
 
 
 def _add_moving(
-    figure: go.Figure, example: Example, place: Points, others: str, sizes: Sequence[float], **more: Any
+    figure: go.Figure, pair: ShownPair, place: Points, others: str, sizes: Sequence[float], **more: Any
 ) -> list[Moving]:
     """Two traces of marks at the ends of the ways, for the other starts and for the answer."""
     kinds = (("another start", others, "circle"), ("answer", ANSWER, "diamond"))
     first = len(figure.data)
-    for paths, (name, colour, symbol), size in zip(_parts(example), kinds, sizes, strict=True):
+    for paths, (name, colour, symbol), size in zip(_parts(pair), kinds, sizes, strict=True):
         _add_marks(figure, place(paths[:, -1]), name, colour, size, symbol=symbol, **more)
-    return [Moving(number, paths, place) for number, paths in enumerate(_parts(example), first)]
+    return [Moving(number, paths, place) for number, paths in enumerate(_parts(pair), first)]
 
 
-def _framed(figure: go.Figure, example: Example, moving: Sequence[Moving]) -> go.Figure:
+def _framed(figure: go.Figure, pair: ShownPair, moving: Sequence[Moving]) -> go.Figure:
     """The figure with its frames, one for each of `frame_steps`."""
-    frames = [[_xyz(each.place(each.paths[:, step])) for each in moving] for step in frame_steps(example)]
+    frames = [[_xyz(each.place(each.paths[:, step])) for each in moving] for step in frame_steps(pair)]
     return figure.update_layout(meta={"traces": [each.trace for each in moving], "frames": frames})
 
 
@@ -299,11 +298,11 @@ def _space(radius: float, longitude: float) -> go.Figure:
     sides = {"xaxis": 1.3, "yaxis": 1.3, "zaxis": 1.1}
     axes = {name: {"visible": False, "range": [-most * radius, most * radius]} for name, most in sides.items()}
     figure = _scene({"x": 2, "y": 2, "z": 1.7}, {"x": x, "y": y, "z": 1}, {"x": 0, "y": 0, "z": -0.05}, **axes)
-    around, gap = _standing(ring(radius)), np.full(3, np.nan)  # a point every two degrees
-    spokes = [point for spoke in around[:180:15] for point in (0.35 * spoke, spoke, gap)]
-    figure.add_trace(_line(np.stack([*around, gap, *spokes]), LINE, 2))
+    spokes, gap = _standing(radius * SPOKES), np.full(3, np.nan)
+    parts = [point for spoke in spokes for point in (0.35 * spoke, spoke, gap)]
+    figure.add_trace(_line(np.stack([*_standing(radius * ROUND), gap, *parts]), LINE, 2))
     text = {"text": ["0°", "90°", "180°", "270°"], "textfont": {"color": MUTED, "size": 11}}
-    return figure.add_trace(_trace(1.12 * around[:180:45], mode="text", hoverinfo="skip", **text))
+    return figure.add_trace(_trace(1.12 * spokes[::3], mode="text", hoverinfo="skip", **text))
 
 
 def _standing(points: NDArray) -> NDArray:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
-from lp_framework.report.parts import RunPart, configuration, packed, read_json, section, tried, words
+from lp_framework.report.parts import RunPart, configuration, packed, read_json, section, tried
 from lp_framework.report.plots import losses_plot
 from lp_framework.report.runs import saved_config
 from lp_framework.viz.training import LOSSES, read_curves
