@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import subprocess
 import sys
 
 import numpy as np
@@ -316,6 +317,13 @@ def test_without_a_package_one_sentence_says_what_to_install(package, monkeypatc
     message = f"solver=features needs the Python package '{package}', which is not installed: pip install"
     with pytest.raises(UserError, match=message + r" 'lp_framework\[features\]'"):
         Features()
+
+
+def test_solvers_and_models_can_be_imported_without_optional_packages():
+    missing = "import sys; sys.modules.update(dict.fromkeys(('cv2', 'poselib', 'dust3r', 'vggt', 'diffusers')))"
+    wanted = "import lp_framework.solvers, lp_framework.models; from lp_framework.solvers import features, feed_forward"
+    ran = subprocess.run([sys.executable, "-c", f"{missing}; {wanted}"], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
 
 
 def test_weights_of_a_matcher_that_cannot_be_had(tmp_path):

@@ -1,5 +1,3 @@
-"""Models of the relative pose and the backbones that they see with; importing the package registers them."""
+"""Models of the relative pose and their backbones. Importing this registers the built-in ones."""
 
-from lp_framework.models import backbones, pose_model
-
-__all__ = ["backbones", "pose_model"]
+from lp_framework.models import backbones, pose_model  # noqa: F401

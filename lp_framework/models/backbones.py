@@ -155,7 +155,6 @@ class EfficientNetLite0(Backbone):
         return self.stem
 
     def trunk_features(self, images: Tensor) -> Tensor:
-        """See `Backbone`."""
         return functional.adaptive_avg_pool2d(self.stem(images), 4).flatten(1)
 
 
@@ -209,5 +208,4 @@ class ResNet(Backbone):
         return self.resnet
 
     def trunk_features(self, images: Tensor) -> Tensor:
-        """See `Backbone`."""
         return self.resnet(((images + 1) / 2 - self.mean) / self.std)

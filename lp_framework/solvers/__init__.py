@@ -1,6 +1,6 @@
-"""Solvers and the starts that they descend from; importing the package registers them."""
+"""Solvers: pairs of images and starting poses in, relative poses out. Importing this registers the built-in ones."""
 
-from lp_framework.solvers import (
+from lp_framework.solvers import (  # noqa: F401
     features,
     feed_forward,
     gauss_newton,
@@ -11,15 +11,3 @@ from lp_framework.solvers import (
     starts,
     two_stage,
 )
-
-__all__ = [
-    "features",
-    "feed_forward",
-    "gauss_newton",
-    "id_pose",
-    "ifusion",
-    "langevin",
-    "multiview",
-    "starts",
-    "two_stage",
-]

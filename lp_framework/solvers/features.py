@@ -63,27 +63,22 @@ class Features(RelativeCameraSolver):
         self.field_of_view = math.radians(field_of_view_degrees)
 
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
-        """See `RelativeCameraSolver.predict`."""
         height, width = pairs.images.shape[-2:]
         if height != width:
             raise UserError(f"solver=features takes square images, got {height} x {width} pixels")
-        seen = {index: self.matcher.describe(pairs.images[index]) for index in self._views(pairs)}
-        seeds = (keyed_bits(seed, pairs.ids, count=1)[:, 0] & 0x7FFFFFFF).tolist()
+        views = torch.cat([pairs.reference, pairs.query]).unique().tolist()
+        seen = {view: self.matcher.describe(pairs.images[view]) for view in views}
+        draws = keyed_bits(seed, pairs.ids, count=1)[:, 0] & 0x7FFFFFFF
         cameras = torch.full((len(pairs), 4, 4), torch.nan, dtype=torch.float64)
         energies = torch.full((len(pairs),), torch.nan, dtype=torch.float64)
-        ends = zip(pairs.reference.tolist(), pairs.query.tolist(), seeds, strict=True)
-        for number, (reference, query, draw) in enumerate(ends):
+        problems = torch.stack([pairs.reference, pairs.query, draws], dim=1).tolist()
+        for number, (reference, query, draw) in enumerate(problems):
             matches = self.matcher.match(seen[reference], seen[query])
             found = self.relative_camera(matches, width, draw)
             if found is not None:
                 cameras[number], energies[number] = torch.from_numpy(found[0]), found[1]
         flip = from_opencv(torch.eye(4, dtype=torch.float64))
         return flip @ from_opencv(cameras), energies, 0 if self.network is None else len(pairs)
-
-    @staticmethod
-    def _views(pairs: Pairs) -> list[int]:
-        used: list[int] = torch.cat([pairs.reference, pairs.query]).unique().tolist()
-        return used
 
     def relative_camera(self, matches: Matches, width: int, seed: int) -> tuple[NDArray[np.float64], float] | None:
         """The query's camera in the reference's frame, `[4, 4]` with OpenCV's axes and a translation of length 1, and

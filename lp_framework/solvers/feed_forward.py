@@ -74,18 +74,15 @@ class Dust3r(FeedForward):
         image_size: int = 512,
         reference_radius: float = 1.4,
     ) -> None:
-        parts = (
-            optional_import(f"dust3r.{part}", "solver=dust3r", "see docs/baselines.md, it is not on the package index")
-            for part in ("model", "inference", "cloud_opt")
+        where = "see docs/baselines.md, it is not on the package index"
+        model, self.inference, self.alignment = (
+            optional_import(f"dust3r.{part}", "solver=dust3r", where) for part in ("model", "inference", "cloud_opt")
         )
-        model, self.inference, self.alignment = parts
         torch.serialization.add_safe_globals([argparse.Namespace])  # in its checkpoint files, beside the weights
-        super().__init__(
-            _loaded(model.AsymmetricCroCo3DStereo.from_pretrained, "DUSt3R", weights), image_size, reference_radius
-        )
+        network = _loaded(model.AsymmetricCroCo3DStereo.from_pretrained, "DUSt3R", weights)
+        super().__init__(network, image_size, reference_radius)
 
     def cameras(self, images: Tensor) -> Tensor:
-        """See `FeedForward.cameras`."""
         shape = torch.tensor([images.shape[-2:]], dtype=torch.int32).numpy()
         first, second = (
             {"img": image[None], "true_shape": shape, "idx": index, "instance": str(index)}
@@ -108,19 +105,13 @@ class VGGT(FeedForward):
 
     patch, passes_per_pair = 14, 1
 
-    def __init__(
-        self,
-        weights: str = "facebook/VGGT-1B",
-        image_size: int = 518,
-        reference_radius: float = 1.4,
-    ) -> None:
+    def __init__(self, weights: str = "facebook/VGGT-1B", image_size: int = 518, reference_radius: float = 1.4) -> None:
         package = "pip install git+https://github.com/facebookresearch/vggt"
         model = optional_import("vggt.models.vggt", "solver=vggt", package)
         self.encoding = optional_import("vggt.utils.pose_enc", "solver=vggt", package)
         super().__init__(_loaded(partial(_load_vggt, model.VGGT), "VGGT", weights), image_size, reference_radius)
 
     def cameras(self, images: Tensor) -> Tensor:
-        """See `FeedForward.cameras`."""
         network: Any = self.network
         batch = (images[None] + 1) / 2
         with torch.autocast(images.device.type, dtype=torch.bfloat16, enabled=images.is_cuda):  # as published

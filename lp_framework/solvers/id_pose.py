@@ -115,7 +115,6 @@ class IDPose(Solver):
     @torch.inference_mode(False)
     @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve` and the class."""
         check_starts(pairs, starts)
         began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,25 +29,25 @@ class Matches(NamedTuple):
     reference: NDArray[np.float64]
     query: NDArray[np.float64]
 
-    def within(self, reference: NDArray[np.bool_], query: NDArray[np.bool_]) -> Matches:
-        """Those whose points lie on the objects, given where these are, `[H, W]` each."""
+    def within(self, *masks: NDArray[np.bool_]) -> Matches:
+        """Those whose points lie on the objects, given where these are in reference and query, `[H, W]` each."""
         kept = np.ones(len(self.reference), dtype=bool)
-        for points, mask in ((self.reference, reference), (self.query, query)):
+        for points, mask in zip(self, masks, strict=True):
             column, row = np.rint(points).astype(int).T
             kept &= mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]
         return Matches(self.reference[kept], self.query[kept])
 
 
-class Matcher(Protocol):
-    """Describes every image once, then matches descriptions."""
+class Matcher(ABC):
+    """Describes every image once, then matches descriptions. `network` is the network, if it has one."""
 
-    @property
-    def network(self) -> nn.Module | None:
-        """The network, if it has one."""
+    network: nn.Module | None = None
 
+    @abstractmethod
     def describe(self, image: Tensor) -> Any:
         """What matching needs of an image `[3, H, W]` in [-1, 1] on white."""
 
+    @abstractmethod
     def match(self, reference: Any, query: Any) -> Matches:
         """Matches on the objects of two described images."""
 
@@ -72,13 +73,11 @@ def pixels(image: Tensor) -> NDArray[np.uint8]:
     return np.ascontiguousarray(levels.permute(1, 2, 0).cpu().numpy())
 
 
-class Sift:
+class Sift(Matcher):
     """SIFT of OpenCV (Lowe 2004) within the object, matched where nearest both ways and clearly nearer than the next.
 
     `ratio` is the largest share that the distance of the nearest descriptor may be of the second nearest's.
     """
-
-    network = None
 
     def __init__(self, ratio: float) -> None:
         self.cv2 = optional_import("cv2", "solver=features", "pip install 'lp_framework[features]'")
@@ -94,7 +93,6 @@ class Sift:
         return places, np.zeros((0, 128), np.float32) if descriptors is None else descriptors
 
     def match(self, reference: Any, query: Any) -> Matches:
-        """See `Matcher`."""
         forth, back = self._pairs(reference[1], query[1]), self._pairs(query[1], reference[1])
         mutual = [(first, second) for first, second in forth.items() if back.get(second) == first]
         first, second = np.array(mutual, dtype=int).reshape(-1, 2).T
@@ -104,28 +102,24 @@ class Sift:
         """For those of our descriptors that pass the ratio test, the nearest of theirs."""
         if len(theirs) < 2:
             return {}
-        neighbours = self.nearest.knnMatch(ours, theirs, k=2)
-        return {
-            first.queryIdx: first.trainIdx
-            for first, next_ in neighbours
-            if first.distance < self.ratio * next_.distance
-        }
+        two = self.nearest.knnMatch(ours, theirs, k=2)
+        return {near.queryIdx: near.trainIdx for near, far in two if near.distance < self.ratio * far.distance}
 
 
-class Learned:
+class Learned(Matcher):
     """A network of transformers that matches key points: LightGlue on SuperPoint (2023) or EfficientLoFTR (2024)."""
 
     network: nn.Module
 
     def __init__(self, name: str, weights: str | None) -> None:
-        user = f"solver.matcher={name}"
-        transformers = optional_import("transformers", user, "pip install 'transformers>=4.54'")
+        user, install = f"solver.matcher={name}", "pip install 'transformers>=4.54'"
+        transformers = optional_import("transformers", user, install)
         source = weights or WEIGHTS[name]
         try:
             self.processor = transformers.AutoImageProcessor.from_pretrained(source)
             self.network = transformers.AutoModelForKeypointMatching.from_pretrained(source)
         except AttributeError as error:
-            raise UserError(f"{user} needs a newer transformers: pip install 'transformers>=4.54'") from error
+            raise UserError(f"{user} needs a newer transformers: {install}") from error
         except Exception as error:  # the hub's package and its HTTP libraries have many of their own
             raise weights_error(name, source, error) from error
         self.network.eval().requires_grad_(False)
@@ -136,15 +130,14 @@ class Learned:
 
     @torch.no_grad()
     def match(self, reference: Any, query: Any) -> Matches:
-        """See `Matcher`."""
-        images = [[reference[0], query[0]]]
-        inputs = self.processor(images, size={"height": SIDE, "width": SIDE}, return_tensors="pt")
+        images = [reference[0], query[0]]
+        inputs = self.processor([images], size={"height": SIDE, "width": SIDE}, return_tensors="pt")
         outputs = self.network(**inputs.to(next(self.network.parameters()).device))
-        sizes = [[tuple(FINER * side for side in image.shape[:2]) for image in images[0]]]
+        sizes = [[tuple(FINER * side for side in image.shape[:2]) for image in images]]
         # Its threshold of scores is the least that EfficientLoFTR's own settings keep.
         (found,) = self.processor.post_process_keypoint_matching(outputs, sizes, threshold=0.2)
         places = []
-        for key, image in zip(("keypoints0", "keypoints1"), images[0], strict=True):
+        for key, image in zip(("keypoints0", "keypoints1"), images, strict=True):
             size = np.array(image.shape[1::-1])  # pixels of SIDE are counted from the centre of their first, too
             places.append(found[key].double().cpu().numpy() / FINER + size / (2 * SIDE) - 0.5)
         return Matches(*places).within(reference[1], query[1])

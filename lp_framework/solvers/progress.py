@@ -16,11 +16,8 @@ _bars: ContextVar[Progress | None] = ContextVar("bars", default=None)
 def shown_progress() -> Iterator[None]:
     """Solvers that run inside show their steps on the terminal, if there is one; the bars go when they are done."""
     console = Console(stderr=True)
-    if not console.is_terminal:
-        yield
-        return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bars:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
         token = _bars.set(bars)
         try:
             yield

@@ -34,7 +34,6 @@ class RelativeCameraSolver(Solver):
 
     @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve` and the class."""
         check_starts(pairs, starts)
         began = now(starts.device)
         cameras, energies, passes = self.predict(pairs, seed)

@@ -8,7 +8,6 @@ longitude and norm are read back from the translation of T.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -27,20 +26,11 @@ from lp_framework.solvers.pair_energy import PairEnergy
 ChooseBy = Literal["accumulated", "rescored"]
 
 
-class RadiusMap(ABC):
-    """Relative radius of a camera at some distance from the canonical object; both functions are elementwise."""
+class SineRadius:
+    """iFusion's: radius = 0.8 sin(norm - 1). It reaches 0.8, where its slope is 0, and at norm 0 down to -0.67.
 
-    @abstractmethod
-    def radius(self, norm: Tensor) -> Tensor:
-        """The relative radius, differentiable."""
-
-    @abstractmethod
-    def norm(self, radius: Tensor) -> Tensor:
-        """The norm of a start's relative radius."""
-
-
-class SineRadius(RadiusMap):
-    """iFusion's: radius = 0.8 sin(norm - 1). It reaches 0.8, where its slope is 0, and at norm 0 down to -0.67."""
+    As of every radius map, `radius` is elementwise and differentiable, and `norm` is its inverse for starts' radii.
+    """
 
     REACH = 0.8
     LEAST = -REACH * math.sin(1)
@@ -55,7 +45,7 @@ class SineRadius(RadiusMap):
         return 1 + (radius / self.REACH).asin()
 
 
-class TanhRadius(RadiusMap):
+class TanhRadius:
     """radius = tanh(log norm) = (norm^2 - 1) / (norm^2 + 1): 0 at norm 1, as iFusion's, but with an inverse.
 
     Its slope 1 - radius^2 in log norm is positive everywhere, and it keeps within (-1, 1). Starts are brought within
@@ -69,6 +59,9 @@ class TanhRadius(RadiusMap):
 
     def norm(self, radius: Tensor) -> Tensor:
         return radius.clamp(-self.LIMIT, self.LIMIT).atanh().exp()
+
+
+RadiusMap = SineRadius | TanhRadius
 
 
 class TwistPoses:
