@@ -10,7 +10,9 @@ from urllib.error import URLError
 
 import pytest
 import torch
+from lightning import Trainer
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from lp_framework import registry, torchvision_ops
 from lp_framework.data.pairs import PairBatch, PairData, ViewTable
@@ -184,6 +186,26 @@ def test_descending_the_loss_brings_it_down(model, noise):
         optimizer.step()
         losses.append(loss.item())
     assert sum(losses[-10:]) < 0.7 * sum(losses[:10])
+
+
+@pytest.mark.parametrize("accumulated", [1, 2, 3])
+def test_every_micro_batch_of_a_step_has_draws_of_its_own(accumulated, monkeypatch):
+    """And the first of them those of a step without accumulation."""
+    model = ScoreModel(Colors(), hidden=8, layers=1)
+    draw, noises, dropout_seeds = model.noised_pose.draw, [], []
+
+    def watched(true: Tensor, generator: torch.Generator) -> Tensor:
+        noises.append(draw(true, generator))
+        dropout_seeds.append(torch.initial_seed())
+        return noises[-1]
+
+    monkeypatch.setattr(model.noised_pose, "draw", watched)
+    quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "accelerator": "cpu"}
+    trainer = Trainer(max_epochs=1, accumulate_grad_batches=accumulated, enable_model_summary=False, **quiet)
+    trainer.fit(model, DataLoader([batch()] * 6, batch_size=None))
+    assert len(noises) == len({noise.sum().item() for noise in noises}) == len(set(dropout_seeds)) == 6
+    first = dropout_seeds[::accumulated]
+    assert first == [(1 << 62) + 1_009 * step for step in range(6 // accumulated)]
 
 
 def test_a_frozen_trunk_stays_in_evaluation_mode_and_gets_no_gradient():

@@ -37,6 +37,7 @@ class TrainedModule(LightningModule):
         self.backbone = backbone
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.schedule, self.seed = schedule, seed
+        self._micro_batch = 0  # of an optimiser step, with trainer.accumulate_grad_batches
 
     # ------------------------------------------------------------ training
 
@@ -46,17 +47,19 @@ class TrainedModule(LightningModule):
 
     def on_train_batch_start(self, batch: PairBatch, batch_idx: int) -> None:
         """Dropout draws from the global generator: keyed as the noise is, apart from it."""
+        self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         torch.manual_seed(self._step_key() + (1 << 62))
 
     def _generator(self) -> torch.Generator:
-        """Noise keyed by seed, step and process, so that a resumed run draws what an uninterrupted one does.
+        """Noise keyed by seed, step, micro-batch and process, so that a resumed run draws what an unbroken one does.
 
         It is drawn on the CPU: a GPU gets the same.
         """
         return torch.Generator().manual_seed(self._step_key())
 
     def _step_key(self) -> int:
-        return (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank
+        step = (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank
+        return step + 0x9E3779B9 * self._micro_batch  # far apart in the 32 bits that a generator on the CPU heeds
 
     def configure_optimizers(self) -> Any:
         parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
