@@ -49,7 +49,7 @@ def around(true: Tensor, *longitudes: float) -> Tensor:
 class ExactModel:
     """A score model of `ExactPrior`'s images: s(x) = truth - x, the score of the line's kernel at sigma 1."""
 
-    has_energy = False
+    has_energy, sigma = False, 1.0
 
     def encode(self, images: Tensor) -> Tensor:
         return images.flatten(1)[:, :3]

@@ -18,9 +18,12 @@ ALPHA = 0.1
 
 
 class Exact:
-    """s(x) = truth - x: the score of the line's kernel at sigma 1. The first three numbers of an image are its pose."""
+    """s(x) = (truth - x) / sigma^2: the line's score. The first three numbers of an image are its pose."""
 
     has_energy = False
+
+    def __init__(self, sigma: float = 1.0) -> None:
+        self.sigma = sigma
 
     def encode(self, images: Tensor) -> Tensor:
         return images.flatten(1)[:, :3]
@@ -29,7 +32,7 @@ class Exact:
         return query - reference
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
-        return FieldValue(condition - pose, None)
+        return FieldValue((condition - pose) / self.sigma**2, None)
 
 
 class ExactEnergy(Exact):
@@ -293,10 +296,17 @@ def test_bad_gammas_are_named(gamma):
         Langevin(Exact(), gamma=gamma)
 
 
-@pytest.mark.parametrize("alpha", [0.0, -0.1, 2.0, math.nan])
-def test_an_alpha_that_does_not_converge_is_refused(alpha):
-    with pytest.raises(UserError, match=r"solver\.alpha must lie between 0 and 2"):
-        Langevin(Exact(), alpha=alpha)
+@pytest.mark.parametrize(("sigma", "alpha"), [(1, 0.0), (1, -0.1), (1, 2.0), (1, math.nan), (0.5, 0.5), (2.0, 8.0)])
+def test_an_alpha_that_does_not_converge_is_refused(sigma, alpha):
+    with pytest.raises(UserError, match=rf"solver\.alpha must lie between 0 and {2 * sigma**2:g}, twice"):
+        Langevin(Exact(sigma), alpha=alpha)
+
+
+@pytest.mark.parametrize(("sigma", "alpha"), [(0.5, 0.49), (2.0, 7.9)])
+def test_an_alpha_below_twice_the_square_of_sigma_converges(sigma, alpha):
+    problem, true = pairs(3, torch.float64)
+    found = Langevin(Exact(sigma), alpha, gamma=0.0, iterations=1000).solve(problem, random_starts(3, 2), seed=0)
+    assert wrap_angle(found.poses - true[:, None]).abs().max() < 1e-3
 
 
 def test_negative_iterations_are_refused():

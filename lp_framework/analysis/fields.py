@@ -50,7 +50,7 @@ class ExactModel(nn.Module):
 
     def __init__(self, kernel: PoseKernel, truth: Tensor, has_energy: bool = False) -> None:
         super().__init__()
-        self.kernel, self.truth, self.has_energy = kernel, truth, has_energy
+        self.kernel, self.truth, self.has_energy, self.sigma = kernel, truth, has_energy, kernel.sigma
 
     def encode(self, images: Tensor) -> Tensor:
         """No features are needed: `[I, 1]`."""

@@ -42,6 +42,7 @@ class PoseModel(TrainedModule):
     it broadcasts against poses `[B, N, 3]`. Here both are tensors; they may be any object that does so.
     """
 
+    sigma: float  # radians and scene units: the field's score is (truth - x) / sigma^2 near an only truth
     has_energy: bool  # whether `field` gives an energy beside the score
     outputs: int  # of the network
 
@@ -73,7 +74,7 @@ class PoseModel(TrainedModule):
             ("dropout", dropout, 0 <= dropout < 1, "in [0, 1)"),
             ("view_loss", view_loss, view_loss >= 0, "at least 0"),
         )
-        self.kernel = PoseKernel(target, sigma)
+        self.sigma, self.kernel = sigma, PoseKernel(target, sigma)
         self.noised_pose = NoisedPose(noise, sigma, noise_low, noise_high)
         self.network = PoseNetwork(
             backbone.feature_dim, self.outputs, hidden, layers, frequencies, self.kernel.periodic, dropout

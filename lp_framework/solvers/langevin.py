@@ -32,8 +32,11 @@ class Langevin(Solver):
         choose_by: Literal["score_norm", "agreement", "energy"] = "score_norm",
         trajectory: bool = False,
     ) -> None:
-        if not 0 < alpha < 2:
-            raise UserError(f"solver.alpha must lie between 0 and 2 for the update to converge, got {alpha}")
+        limit = 2 * model.sigma**2  # a step leaves 1 - alpha / sigma^2 of the way to the truth
+        if not 0 < alpha < limit:
+            raise UserError(
+                f"solver.alpha must lie between 0 and {limit:g}, twice the model's sigma^2, to converge; got {alpha}"
+            )
         check_settings("solver", ("iterations", iterations, iterations >= 0, "at least 0"))
         if choose_by == "energy" and not model.has_energy:
             raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use score_norm")
