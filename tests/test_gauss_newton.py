@@ -54,7 +54,7 @@ def test_it_needs_far_fewer_passes_than_adam():
     newton = refine(ExactPrior(), 3).solve(pairs, starts, seed=0)
     adam = TwoStage(ExactModel(), ExactPrior(), iterations=0).solve(pairs, starts, seed=0)
     assert offsets(newton.poses, true).norm(dim=-1).max() < 0.1 * offsets(adam.poses, true).norm(dim=-1).max()
-    images, look, step = 12, 6, 6 * 2 * 4  # images are encoded by both stages; the model looks at its starts
+    images, look, step = 12, 3 * 6, 6 * 2 * 4  # images are encoded by both stages; the model looks around its starts
     assert newton.cost.network_passes == 2 * images + look + 4 * step
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
+from lp_framework.models.objectives import PoseKernel
 from lp_framework.models.pose_model import FieldValue
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.langevin import Langevin
@@ -40,6 +41,13 @@ class ExactEnergy(Exact):
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue(condition - pose, 0.5 * (condition - pose).square().sum(-1))
+
+
+class OnTheCircle(Exact):
+    """The score of the wrapped kernel, which is nothing at the truth and nothing at its antipode."""
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        return FieldValue(PoseKernel("periodic", self.sigma).score(pose, condition), None)
 
 
 class FailsFarAway(Exact):
@@ -178,7 +186,7 @@ def test_image_features_are_computed_once_an_image():
     problem, _ = pairs(6)
     solution = Langevin(Counting(), iterations=10).solve(problem, random_starts(6, 4), seed=0)
     assert Counting.encoded == 7
-    assert solution.cost.network_passes == 7 + 6 * 4 * 11
+    assert solution.cost.network_passes == 7 + 6 * 4 * (11 + 2)  # two for the slope of the last score
     assert solution.cost.seconds > 0
 
 
@@ -214,12 +222,34 @@ def distances(solver: Langevin, problem: Pairs, true: Tensor, starts: Tensor) ->
     return chosen, every
 
 
-def test_the_norm_of_the_score_chooses_the_start_that_ended_nearest():
+def test_the_least_distance_chooses_the_start_that_ended_nearest():
     problem, true = pairs(100)
-    solver = Langevin(Exact(), gamma=(0.2, 0.2, 0.2), iterations=20, choose_by="score_norm")
+    solver = Langevin(Exact(), gamma=(0.2, 0.2, 0.2), iterations=20, choose_by="distance")
     chosen, every = distances(solver, problem, true, random_starts(100, 6))
     torch.testing.assert_close(chosen, every.min(dim=1).values)
     assert chosen.mean() < 0.6 * every.mean()
+
+
+@pytest.mark.parametrize("model", [Exact, OnTheCircle])
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
+def test_the_distance_rises_up_to_the_antipode(model, sigma):
+    problem, true = pairs(2, torch.float64)
+    away = torch.linspace(0, math.pi, 100, dtype=torch.float64)
+    starts = true[:, None].repeat(1, 100, 1)
+    starts[..., 1] += away
+    told = Langevin(model(sigma), gamma=0, iterations=0).solve(problem, starts, seed=0).energies
+    assert (told.diff(dim=1) > 0).all()
+    torch.testing.assert_close(told[:, 0], torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-6)
+    torch.testing.assert_close(told[:, -1], torch.full((2,), math.pi, dtype=torch.float64), rtol=0.05, atol=0)
+
+
+def test_an_end_at_the_antipode_is_not_the_answer():
+    """There the score vanishes, as it does at the truth."""
+    problem, true = pairs(4, torch.float64)
+    starts = true[:, None].repeat(1, 3, 1)
+    starts[..., 1] += torch.tensor([math.pi, math.pi - 0.01, 2.0])
+    solution = Langevin(OnTheCircle(), gamma=0, iterations=5).solve(problem, starts, seed=0)
+    assert (solution.chosen == 2).all()
 
 
 def test_agreement_passes_over_a_minority_that_ended_wrong():
@@ -232,8 +262,8 @@ def test_agreement_passes_over_a_minority_that_ended_wrong():
     assert every.max() > 1
     assert chosen.max() < 0.05
     assert chosen.mean() < 0.2 * every.mean()
-    by_norm, _ = distances(Langevin(Misled(), gamma=0, choose_by="score_norm"), problem, true, starts)
-    assert by_norm.max() > 1  # what is as sure of itself elsewhere, the norm cannot tell
+    by_distance, _ = distances(Langevin(Misled(), gamma=0, choose_by="distance"), problem, true, starts)
+    assert by_distance.max() > 1  # what is as sure of itself elsewhere, the field cannot tell
 
 
 def test_agreement_beats_a_random_start_with_noise():
@@ -255,7 +285,7 @@ def test_a_score_model_has_no_energy_to_choose_by():
         Langevin(Exact(), choose_by="energy")
 
 
-@pytest.mark.parametrize("choose_by", ["score_norm", "agreement"])
+@pytest.mark.parametrize("choose_by", ["distance", "agreement"])
 @pytest.mark.parametrize("place", [0, 2, 3])
 def test_a_start_where_the_model_fails_stops_alone_and_is_not_chosen(choose_by, place):
     problem, _ = pairs(3)

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
+from lp_framework.models.objectives import PoseKernel
+from lp_framework.models.pose_model import FieldValue
 from lp_framework.solvers.base import ViewSets
 from lp_framework.solvers.multiview import MultiView
 from lp_framework.solvers.starts import Random
@@ -32,6 +34,13 @@ class Short(ExactModel):
 
     def condition(self, reference: Tensor, query: Tensor) -> Tensor:
         return 0.8 * super().condition(reference, query)
+
+
+class OnTheCircle(ExactModel):
+    """The score of the wrapped kernel, which vanishes at the antipode of the truth as well."""
+
+    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
+        return FieldValue(PoseKernel().score(pose, condition), None)
 
 
 class Blind(ExactModel):
@@ -100,6 +109,20 @@ def test_the_fit_overrules_pairs_where_the_model_is_wrong():
     assert wrong > 0.1
     together = solver.solve_views(sets, starts, seed=0).poses
     assert (distance(together, true) > 1).double().mean() < 0.1 * wrong
+
+
+def test_ends_at_the_antipode_weigh_next_to_nothing():
+    """Most of the starts stay where the score vanishes although the truth is half a turn away."""
+    sets, true = exact_sets(6, 4)
+    starts = true[:, :, None].repeat(1, 1, 3, 1)
+    starts[:, :, :2, 1] += math.pi
+    starts[:, :, 2, 1] += 1.5
+    starts[..., ::2] = 0
+    solver = MultiView(OnTheCircle(), ExactPrior(), gamma=0.0, iterations=20, second_stage=False)
+    measured = solver.measure(sets, starts, seed=0)
+    weights = measured.weights[:, 0, 1:]
+    assert (weights[..., :2] < 0.1 * weights[..., 2:]).all()
+    assert distance(solver.solve_views(sets, starts, seed=0).poses, true).max() < 0.5
 
 
 def test_the_second_stage_corrects_what_the_first_cannot_see():
@@ -194,7 +217,7 @@ def test_the_seed_decides():
 
 def test_network_passes():
     sets, _ = exact_sets(2, 4)
-    images, first, second = 8, 2 * 12 * 3 * 51, 2 * 12 * (50 + 16)
+    images, first, second = 8, 2 * 12 * 3 * (51 + 2), 2 * 12 * (50 + 16)
     cost = MultiView(ExactModel(), ExactPrior()).solve_views(sets, starts_of(sets, 3), seed=0).cost
     assert cost.network_passes == images + first + images + second
     assert cost.seconds > 0

@@ -13,7 +13,7 @@ from lp_framework.clock import now
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import reduce_longitude, wrap_angle
 from lp_framework.keyed_random import keyed_normal
-from lp_framework.models.pose_model import FieldValue, PoseModel
+from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
 from lp_framework.solvers.progress import steps_of
@@ -21,7 +21,12 @@ from lp_framework.solvers.progress import steps_of
 
 @register("solver", "langevin")
 class Langevin(Solver):
-    """First stage alone: x <- x + alpha s(x) + gamma z on a score or energy model, for all starts of all pairs."""
+    """First stage alone: x <- x + alpha s(x) + gamma z on a score or energy model, for all starts of all pairs.
+
+    `choose_by` says by what the answer is chosen among the ends: `distance`, the least distance to the truth that the
+    field itself tells, so that under noise it is the end that happens to be nearest; `agreement`, the least median
+    distance to the other ends; `energy`, that of an energy model.
+    """
 
     def __init__(
         self,
@@ -29,7 +34,7 @@ class Langevin(Solver):
         alpha: float = 0.1,
         gamma: float | Sequence[float] = (0.0, 0.3, 0.0),
         iterations: int = 50,
-        choose_by: Literal["score_norm", "agreement", "energy"] = "score_norm",
+        choose_by: Literal["distance", "agreement", "energy"] = "distance",
         trajectory: bool = False,
     ) -> None:
         limit = 2 * model.sigma**2  # a step leaves 1 - alpha / sigma^2 of the way to the truth
@@ -39,7 +44,7 @@ class Langevin(Solver):
             )
         check_settings("solver", ("iterations", iterations, iterations >= 0, "at least 0"))
         if choose_by == "energy" and not model.has_energy:
-            raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use score_norm")
+            raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use distance")
         self.model = model
         self.alpha, self.gamma = alpha, _triple(gamma)
         self.iterations, self.choose_by, self.trajectory = iterations, choose_by, trajectory
@@ -56,14 +61,14 @@ class Langevin(Solver):
         for step in steps_of(self.iterations, "first stage"):
             pose = pose + self.alpha * self.model.field(condition, pose).score + noise[:, :, step]
             trajectory.append(pose)
-        energies = self._energies(pose, self.model.field(condition, pose))
-        passes = len(pairs.images) + starts.shape[0] * starts.shape[1] * (self.iterations + 1)
+        energies = self._energies(condition, pose)
+        looks = self.iterations + {"distance": 3, "energy": 1, "agreement": 0}[self.choose_by]
         return Solution(
             poses=reduce_longitude(pose),
             energies=energies,
             valid=pose.isfinite().all(dim=-1),
             chosen=choose(energies),
-            cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
+            cost=Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks, now(starts.device) - began),
             trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
         )
 
@@ -76,21 +81,33 @@ class Langevin(Solver):
         gamma = torch.tensor(self.gamma, dtype=draws.dtype, device=draws.device)
         return draws.view(len(pairs), starts, self.iterations, 3) * gamma
 
-    def _energies(self, pose: Tensor, field: FieldValue) -> Tensor:
-        """By what the answer is chosen, `[B, N]`.
+    def _energies(self, condition: Tensor, ends: Tensor) -> Tensor:
+        """By what the answer is chosen, `[B, N]`: see the class."""
+        if self.choose_by == "distance":
+            return self._distance(condition, ends)
+        if self.choose_by == "agreement":
+            offset = ends[:, :, None] - ends[:, None]
+            offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
+            return offset.norm(dim=-1).nanmedian(dim=-1).values  # a start that failed leaves the others theirs
+        energy = self.model.field(condition, ends).energy
+        assert energy is not None  # of the constructor's check
+        return energy
 
-        `score_norm`: the distance that the model itself still sees, |s| = |x - x_gt| / sigma^2 for an exact score: with
-        noise it picks the start that ended nearest. `agreement`: the median distance to the other starts' ends.
-        `energy`: the energy model's.
+    def _distance(self, condition: Tensor, pose: Tensor) -> Tensor:
+        """The distance `[B, N]` to the truth (radians, scene units) that the field tells, by Tweedie's formulas.
+
+        The mean offset from the truth is -sigma^2 s (first order): all of the distance where only one image of the
+        truth around the circle counts. Towards the antipode the images on either side cancel out and s vanishes; there
+        its slope s' along the longitude is positive, and the mean square, sigma^4 (s^2 + s') + sigma^2 (second order),
+        still tells the distance. Elsewhere that would only add the noise of a learned slope.
         """
-        if self.choose_by == "energy":
-            assert field.energy is not None  # of the constructor's check
-            return field.energy
-        if self.choose_by == "score_norm":
-            return field.score.norm(dim=-1)
-        offset = pose[:, :, None] - pose[:, None]
-        offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
-        return offset.norm(dim=-1).nanmedian(dim=-1).values  # a start that failed leaves the others theirs
+        variance = self.model.sigma**2
+        step = 0.02 * variance * pose.new_tensor([0.0, 1.0, 0.0])
+        score = self.model.field(condition, pose).score
+        ahead, behind = (self.model.field(condition, each).score[..., 1] for each in (pose + step, pose - step))
+        slope = (ahead - behind) / (2 * step[1])
+        beyond = torch.where(slope > 0, variance**2 * slope + variance, 0.0)
+        return (variance**2 * score.square().sum(dim=-1) + beyond).sqrt()
 
 
 def _triple(gamma: float | Sequence[float]) -> list[float]:

@@ -27,7 +27,7 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
 from lp_framework.solvers.twist import DescentSettings, TanhRadius, TwistPoses
 
-NEAREST = 0.1  # distance to the truth (radians, scene units) below which the norm of a score does not tell it
+NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model does not tell it
 
 
 class Measured(NamedTuple):
@@ -60,9 +60,10 @@ class MultiView(Solver):
     """Joint reasoning over 2 to 8 images: pairwise first stage, a robust fit of absolute poses, joint refinement.
 
     First stage: `langevin` (`alpha`, `gamma`, `iterations`) on all ordered pairs, each from the starts of its query.
-    All their ends are measurements for `fit_views`, weighted by 1 / (|s|^2 + 0.1^2): the norm of an exact score is the
-    distance that is left to the truth. Second stage: as in `two_stage`, a twist for each image but the first, by
-    Adam from the fitted poses, descends the sum of the prior's energies over all ordered pairs (paper, Eq. 5).
+    All their ends are measurements for `fit_views`, weighted by 1 / (d^2 + 0.1^2), with d the distance to the truth
+    that the model tells there (`choose_by=distance` of `langevin`). Second stage: as in `two_stage`, a twist for each
+    image but the first, by Adam from the fitted poses, descends the sum of the prior's energies over all ordered pairs
+    (paper, Eq. 5).
 
     Without `first_stage` the second descends from the starts themselves, number n of all images together, and the
     answer has the least energy on `rescoring` noises and timesteps, the same for all. Without `second_stage` the
@@ -151,7 +152,8 @@ class MultiView(Solver):
         poses = starts.new_full((sets, views, views, starts.shape[2], 3), torch.nan)
         poses[:, reference, query] = solution.poses.unflatten(0, (sets, -1))
         weights = torch.zeros_like(poses[..., 0])
-        weights[:, reference, query] = 1 / (solution.energies.unflatten(0, (sets, -1)).square() + NEAREST**2)
+        distance = solution.energies.unflatten(0, (sets, -1))
+        weights[:, reference, query] = 1 / (distance.square() + NEAREST**2)
         return Measured(poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes)
 
     def fit(self, measured: Measured) -> Joint:
