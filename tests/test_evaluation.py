@@ -22,6 +22,7 @@ from lp_framework.commands.eval import pairs_at_once
 from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairBatch
 from lp_framework.evaluation.evaluation import errors
+from lp_framework.evaluation.metrics import summarise
 from lp_framework.geometry import camera_to_world, relative_camera, rigid_transform, so3_exp
 from lp_framework.models.checkpoints import SHIPPED
 from lp_framework.solvers.base import Cost, Solution
@@ -234,6 +235,21 @@ def test_errors_compare_the_querys_predicted_camera_with_its_true_one():
     torch.testing.assert_close(rotation[:, 1], torch.full((2,), 10.0, dtype=torch.float64), rtol=0, atol=1e-3)
     across = 2 * math.sin(math.radians(5)) * (poses[:, 2] * poses[:, 0].cos())[batch.query]
     torch.testing.assert_close(translation[:, 1], across, rtol=1e-4, atol=1e-5)
+
+
+def test_a_start_that_is_not_valid_is_a_failure_wherever_it_ended():
+    poses = torch.tensor([[0.1, 0.3, 1.5], [0.4, 2.0, 1.3]], dtype=torch.float64)
+    batch = PairBatch(
+        pixels=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
+        reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]), pairs=torch.tensor([1, 2]),
+    )  # fmt: skip
+    right = batch.relative_poses()[:, None].double().expand(-1, 3, -1)
+    valid, chosen = torch.tensor([[True, False, True], [True, True, False]]), torch.zeros(2).long()
+    rotation, translation = errors(Solution(right, torch.zeros(2, 3), valid, chosen, Cost(0, 0.0)), batch)
+    metrics = summarise(rotation, translation, chosen)
+    assert metrics["SR@5"] == metrics["SR(R)@30"] == pytest.approx(4 / 6)
+    assert metrics["R@5"] == metrics["R(R)@30"] == 1
+    assert rotation.isnan().tolist() == translation.isnan().tolist() == (~valid).tolist()
 
 
 def test_full_cameras_are_judged_at_the_scale_that_suits_each_best():

@@ -115,7 +115,8 @@ class Evaluation(LightningModule):
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
     """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one.
 
-    Full cameras are taken at the scale that suits each best (the paper's Details of Baseline Settings).
+    Full cameras are taken at the scale that suits each best (the paper's Details of Baseline Settings). A start that is
+    not valid has no error but NaN, which the metrics count as a failure.
     """
     true = batch.cameras[batch.query][:, None]
     if solution.cameras is None:
@@ -124,5 +125,6 @@ def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
     else:
         camera = batch.cameras[batch.reference][:, None]
         predicted = camera @ at_optimal_scale(solution.cameras.double(), relative_camera(camera, true))
-    true = true.expand_as(predicted)
-    return rotation_error(predicted, true), translation_error(predicted, true)
+    true, invalid = true.expand_as(predicted), ~solution.valid
+    rotation, translation = rotation_error(predicted, true), translation_error(predicted, true)
+    return rotation.masked_fill(invalid, torch.nan), translation.masked_fill(invalid, torch.nan)
