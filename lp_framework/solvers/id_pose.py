@@ -58,7 +58,7 @@ class IDPose(Solver):
     to `timestep + timestep_span` (shares of the prior's range). The better half descends by `exploration_steps`, is
     probed again, and the `kept` best stay. Among more than two images a candidate is judged by how well it goes with
     the others' (triangular selection). The chosen ones descend by `refinement_steps` for each unknown image, with
-    fresh noise, at `timestep`; the answer is the mean of the last `averaged` poses before an update.
+    fresh noise, at `timestep`; the answer is the mean of an image's last `averaged` poses, without the last step's.
 
     A `Solution` has the kept candidates as its N: the chosen one refined, the others as explored; the energies are
     those of the candidates before refinement, by which it was chosen.
@@ -239,10 +239,11 @@ class IDPose(Solver):
         steps, flat = len(moved), selected.flatten(1)[:, None]
         trajectory, _, valid = descend(one_pair, _same, flat, steps, GradientDescent(flat, self.refinement_rate))
         trajectory = trajectory[:, 0].unflatten(2, (others, 3))  # [S, steps + 1, V - 1, 3]
-        before = moved[..., 1:].transpose(0, 1)  # [S, steps, V - 1]
-        late = before & (before.flip(1).cumsum(1).flip(1) <= self.averaged)
+        # As published, a pose is recorded when the step after its update begins: the last step's never is.
+        recorded = moved[:-1, :, 1:].transpose(0, 1)  # [S, steps - 1, V - 1]
+        late = recorded & (recorded.flip(1).cumsum(1).flip(1) <= self.averaged)
         count = late.sum(dim=1)[..., None]
-        mean = trajectory[:, :-1].masked_fill(~late[..., None], 0.0).sum(dim=1) / count
+        mean = trajectory[:, 1:-1].masked_fill(~late[..., None], 0.0).sum(dim=1) / count
         return Refined(torch.where(count > 0, mean, selected), valid[:, 0], trajectory)
 
     def _moved(self, cycle: Sequence[tuple[int, int]], ids: Tensor, seed: int, others: int) -> Tensor:
