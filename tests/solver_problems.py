@@ -8,6 +8,7 @@ import torch
 from exact_prior import ExactPrior, image_of
 from torch import Tensor
 
+from lp_framework.geometry import wrap_angle
 from lp_framework.models.pose_model import FieldValue
 from lp_framework.priors.base import ViewCode
 from lp_framework.solvers.base import Pairs, ViewSets
@@ -44,6 +45,12 @@ def around(true: Tensor, *longitudes: float) -> Tensor:
     starts[..., 1] += torch.tensor(longitudes, dtype=true.dtype)
     starts[..., ::2] = 0.0
     return starts
+
+
+def away(poses: Tensor, true: Tensor) -> Tensor:
+    """Differences `[..., 3]` of poses to true ones, longitudes on the circle: in [-pi, pi)."""
+    latitude, longitude, radius = (poses - true).unbind(-1)
+    return torch.stack([latitude, wrap_angle(longitude), radius], dim=-1)
 
 
 class ExactModel:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from solver_problems import away
 from zero123_checkpoint import golden, write_checkpoint
 
 from lp_framework.geometry import camera_to_world, se3_exp, view_pose
@@ -118,7 +119,9 @@ def test_ten_steps_of_ifusions_loop(prior, code, arrays):
         optimizer.step()
         scheduler.step(sum(losses))
     trajectory.append(pose().detach() * SIGN)
-    close(torch.stack(trajectory), arrays["adam_traj"], 1e-3)
+    for turn in (0.0, 2 * torch.pi):  # a published longitude may lie in any turn
+        there = arrays["adam_traj"].float() + torch.tensor([0.0, turn, 0.0])
+        assert away(torch.stack(trajectory), there).abs().max() < 1e-3
     close(torch.tensor(losses), arrays["adam_loss"], 1e-4)
     close(twist.detach(), arrays["adam_xi"], 1e-3)
 
