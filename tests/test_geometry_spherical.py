@@ -16,6 +16,7 @@ from lp_framework.geometry import (
     apply_relative_pose,
     camera_to_world,
     from_ifusion,
+    reduce_longitude,
     relative_pose,
     rigid_transform,
     so3_exp,
@@ -63,6 +64,20 @@ def test_wrap_angle_stays_in_its_half_open_range(dtype: torch.dtype) -> None:
     assert (wrapped >= -pi).all() and (wrapped < pi).all()
     torch.testing.assert_close(wrapped.sin(), angles.sin(), rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-14)
     assert wrap_angle(pi) == -pi and wrap_angle(-pi) == -pi
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_reduced_longitude_is_in_its_half_open_range_and_kept_where_it_was(dtype: torch.dtype) -> None:
+    inside = torch.linspace(0, 2 * math.pi, 1001, dtype=torch.float64)[:-1].to(dtype)
+    tiny = torch.tensor([-1e-9, -1e-30, -0.0], dtype=dtype)  # from which a turn up is the whole turn, rounded
+    for longitude in (inside, tiny, inside - 40, inside + 40):
+        pose = torch.stack([torch.full_like(longitude, 0.3), longitude, torch.full_like(longitude, 1.4)], dim=-1)
+        reduced = reduce_longitude(pose)
+        assert (reduced[:, 1] >= 0).all() and (reduced[:, 1] < 2 * math.pi).all()
+        assert torch.equal(reduced[:, ::2], pose[:, ::2])
+        torch.testing.assert_close(reduced[:, 1].cos(), longitude.cos(), rtol=0, atol=2e-5)
+    same = reduce_longitude(torch.stack([inside] * 3, dim=-1))[:, 1]
+    assert torch.equal(same, inside)
 
 
 def test_wrap_angle_keeps_what_is_in_range_to_the_last_digit() -> None:

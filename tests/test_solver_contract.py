@@ -50,7 +50,7 @@ def test_a_solution_has_its_shapes_and_finite_numbers(name):
     assert ((solution.chosen >= 0) & (solution.chosen < count)).all()
     assert solution.valid.dtype == torch.bool and solution.valid.all()
     assert solution.poses.isfinite().all() and solution.energies.isfinite().all()
-    assert ((solution.poses[..., 1] >= 0) & (solution.poses[..., 1] <= 2 * torch.pi)).all()
+    assert ((solution.poses[..., 1] >= 0) & (solution.poses[..., 1] < 2 * torch.pi)).all()
     assert not solution.poses.requires_grad
     assert (solution.cost.network_passes > 0) == (name not in WITHOUT_NETWORK) and solution.cost.seconds > 0
     assert torch.equal(solution.answer(), solution.poses[torch.arange(3), solution.chosen])

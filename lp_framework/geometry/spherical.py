@@ -35,13 +35,13 @@ def _reduce(angle: Tensor, turn: float) -> Tensor:
 
 
 def reduce_longitude(pose: Tensor) -> Tensor:
-    """The same pose `[..., 3]` with its longitude in [0, 2 pi).
+    """The same pose `[..., 3]` with its longitude in [0, 2 pi); exact for longitudes already there.
 
     >>> reduce_longitude(torch.tensor([0.1, -0.5, 1.5]))
     tensor([0.1000, 5.7832, 1.5000])
     """
-    latitude, longitude, radius = pose.unbind(-1)
-    return torch.stack([latitude, wrap_angle(longitude) % (2 * math.pi), radius], dim=-1)
+    latitude, longitude, radius = pose.split(1, dim=-1)
+    return torch.cat([latitude, _reduce(longitude, 2 * math.pi), radius], dim=-1)
 
 
 def relative_pose(reference: Tensor, query: Tensor) -> Tensor:
@@ -50,8 +50,7 @@ def relative_pose(reference: Tensor, query: Tensor) -> Tensor:
     >>> relative_pose(torch.tensor([0.1, 6.2, 1.5]), torch.tensor([0.3, 0.1, 1.5]))
     tensor([0.2000, 0.1832, 0.0000])
     """
-    latitude, longitude, radius = (query - reference).split(1, dim=-1)
-    return torch.cat([latitude, _reduce(longitude, 2 * math.pi), radius], dim=-1)
+    return reduce_longitude(query - reference)
 
 
 def apply_relative_pose(reference: Tensor, x: Tensor) -> Tensor:
@@ -60,8 +59,7 @@ def apply_relative_pose(reference: Tensor, x: Tensor) -> Tensor:
     >>> apply_relative_pose(torch.tensor([0.1, 6.2, 1.5]), torch.tensor([0.2, 0.1832, 0.0]))
     tensor([0.3000, 0.1000, 1.5000])
     """
-    latitude, longitude, radius = (reference + x).split(1, dim=-1)
-    return torch.cat([latitude, _reduce(longitude, 2 * math.pi), radius], dim=-1)
+    return reduce_longitude(reference + x)
 
 
 def camera_to_world(pose: Tensor) -> Tensor:
@@ -96,7 +94,7 @@ def view_pose(camera: Tensor) -> Tensor:
     polar = horizontal_squared <= (4 * torch.finfo(x.dtype).eps * radius).square()
     horizontal = horizontal_squared.masked_fill(polar, 1.0).sqrt().masked_fill(polar, 0.0)
     longitude = torch.atan2(torch.where(polar, -camera[..., 2, :1], x), torch.where(polar, camera[..., 0, :1], z))
-    return torch.cat([torch.atan2(y, horizontal), _reduce(longitude, 2 * math.pi), radius], dim=-1)
+    return reduce_longitude(torch.cat([torch.atan2(y, horizontal), longitude, radius], dim=-1))
 
 
 def spherical_residual(camera: Tensor) -> Tensor:
@@ -119,7 +117,7 @@ def from_ifusion(latlon_degrees: Tensor) -> Tensor:
     tensor([0.5236, 1.5708, 1.5000])
     """
     down, longitude, radius = latlon_degrees.split(1, dim=-1)
-    return torch.cat([-torch.deg2rad(down), _reduce(torch.deg2rad(longitude), 2 * math.pi), radius], dim=-1)
+    return reduce_longitude(torch.cat([-torch.deg2rad(down), torch.deg2rad(longitude), radius], dim=-1))
 
 
 def to_ifusion(pose: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from lp_framework.geometry import wrap_angle
+from lp_framework.geometry import relative_pose, wrap_angle
 
 SCALE = 0.2  # radians and scene units: a measurement off by more counts less the further it is off
 FIRST_SCALE = 2.0  # nearly least squares
@@ -44,9 +44,7 @@ def fit_views(measured: Tensor, weights: Tensor) -> Tensor:
         squared = _residual(poses, measured).square().sum(dim=-1)
     cost = (weights * squared / (squared + SCALE**2)).sum(dim=(-3, -2, -1))
     best = poses[torch.arange(len(poses), device=poses.device), cost.argmin(dim=1)]
-    relative = best - best[:, :1]
-    relative[..., 1] = wrap_angle(relative[..., 1]) % (2 * math.pi)
-    return relative
+    return relative_pose(best[:, :1], best)
 
 
 def _synchronised(measured: Tensor, weights: Tensor) -> Tensor:
