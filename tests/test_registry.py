@@ -140,9 +140,7 @@ def test_a_plugin_cannot_take_the_name_of_a_built_in():
 
 
 def test_a_missing_optional_package_is_named_with_what_installs_it():
-    with pytest.raises(
-        UserError, match="x needs the Python package 'tmp_needed', which is not installed: y"
-    ):
+    with pytest.raises(UserError, match="x needs the Python package 'tmp_needed', which is not installed: y"):
         optional_import("tmp_needed", "x", "y")
 
 
