@@ -22,7 +22,7 @@ from PIL import Image
 from torch import Tensor
 
 from lp_framework.analysis.fields import Draws
-from lp_framework.analysis.landscapes import Landscape, PoseMap
+from lp_framework.analysis.landscapes import Landscape, PoseMap, landscape_grid
 from lp_framework.analysis.pairs import (
     shown_pairs,
     solved_pairs,
@@ -96,11 +96,12 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
         shown = with_prior_energy(pairs, shown, prior, draws)
     if isinstance(model, PoseModel):
         shown = with_model_landscape(pairs, shown, model)
+    if isinstance(model, PoseModel) and not sets:
         ways, first_stage = [pair.ways for pair in shown], solver if isinstance(solver, Langevin) else None
         shown = with_fields(pairs, shown, model, ways, first_stage, starts, evaluation.seed)
-    else:
+    elif not sets:
         shown = [replace(pair, maps=[PoseMap("Starts and answer", ways=pair.ways)]) for pair in shown]
-    mapped = set() if sets else {pick.row for pick in pick_pairs(answer, objects, table.unique_answer)}
+    mapped = {pick.row for pick in pick_pairs(answer, objects, table.unique_answer)}
     return [
         replace(
             pair,
@@ -124,7 +125,8 @@ def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
     """Whether the prior's landscapes of so many pairs take little time, by what the evaluation's own passes took."""
     costs = evaluation.costs.compute()
     seconds, before = costs["seconds"], costs["passes"]
-    passes = 2 * pairs * len(draws.steps()) * 16 * 30  # both directions; poses of the paper's grid
+    latitude, longitude = landscape_grid()
+    passes = 2 * pairs * len(draws.steps()) * len(latitude) * len(longitude)  # both directions
     return before > 0 and passes * seconds / before <= max(SECONDS, SHARE * seconds)
 
 

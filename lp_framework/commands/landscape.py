@@ -38,7 +38,6 @@ from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, photograph_files, prepared_photographs
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_arrays, write_json
-from lp_framework.geometry import wrap_angle
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
@@ -128,7 +127,7 @@ def write_pair(
     pictures = [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
     example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
     save_examples(folder / "pictures" / EXAMPLES, [example])
-    console.print(pair_table(f"{pair.object}, prior={config.prior.name}", method, pair))
+    console.print(pair_table(f"{pair.object}, prior={config.prior.name}", method, record))
     console.print(f"results: {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
     console.print(f"picture: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True)
 
@@ -220,29 +219,23 @@ def in_degrees(pose: NDArray) -> tuple[float, float, float]:
     return math.degrees(latitude), math.degrees(longitude) % 360, radius
 
 
-def pair_table(title: str, method: str, pair: ShownPair) -> Table:
-    """The truth, the minima and the ends."""
+def pair_table(title: str, method: str, record: dict[str, Any]) -> Table:
+    """The truth, the minima and the ends, as `summary` has them."""
     columns = ("", "latitude", "longitude", "height", "prominence", "from the truth")
-    table = table_of(title, columns, numbers=columns[1:])
-
-    def add(name: str, latitude: float, longitude: float, *cells: str) -> None:
-        table.add_row(name, f"{latitude:.0f}°", f"{longitude:.0f}°", *cells)
-
-    if pair.truth is not None:
-        add("truth", *in_degrees(pair.truth)[:2])
-    for number, minimum in enumerate(pair.prior_energy.minima(), start=1):
-        away = ""
-        if pair.truth is not None:
-            offset = wrap_angle(torch.tensor(minimum.longitude - float(pair.truth[1]))).abs().item()
-            away = f"{math.degrees(offset):.0f}° in longitude"
-        place = math.degrees(minimum.latitude), math.degrees(minimum.longitude)
-        add(f"minimum {number}", *place, f"{minimum.height:.2f}", f"{minimum.prominence:.2f}", away)
+    table, truth = table_of(title, columns, numbers=columns[1:]), record["truth"]
+    if truth is not None:
+        table.add_row("truth", *(f"{angle:.0f}°" for angle in truth[:2]))
+    for number, minimum in enumerate(record["minima"], start=1):
+        latitude, longitude, _, height, prominence = minimum.values()
+        away = "" if truth is None else f"{abs((longitude - truth[1] + 180) % 360 - 180):.0f}° in longitude"
+        place = f"{latitude:.0f}°", f"{longitude:.0f}°"
+        table.add_row(f"minimum {number}", *place, f"{height:.2f}", f"{prominence:.2f}", away)
     table.add_section()
-    ends = zip(start_longitudes(pair), pair.ends, pair.rotation_errors, strict=True)
-    for number, (start, end, error) in enumerate(ends):
-        mark = " (answer)" if number == pair.chosen else ""
-        off = "" if pair.truth is None else f"{error:.0f}°{mark}"
-        add(method if start is None else f"{method} from {start:.0f}°", *in_degrees(end)[:2], "", "", off)
+    for each in record["descents"]:
+        start, error = each["start_longitude"], each["rotation_error"]
+        off = "" if error is None else f"{error:.0f}°{' (answer)' if each['chosen'] else ''}"
+        place = f"{each['end'][0]:.0f}°", f"{each['end'][1]:.0f}°"
+        table.add_row(method if start is None else f"{method} from {start:.0f}°", *place, "", "", off)
     return table
 
 
