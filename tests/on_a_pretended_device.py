@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hydra.core.plugins import Plugins
 from lightning import Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
@@ -33,6 +34,7 @@ from lp_framework.priors.zero123.prior import Zero123Prior
 from lp_framework.solvers.base import Solution
 from lp_framework.solvers.pair_energy import PairEnergy
 
+Plugins.instance()  # Hydra stores the configs of its own plugins once, as conftest.py has it
 ON_HOST = ("dust3r", "features", "vggt")  # matching and other people's packages compute in NumPy, or by themselves
 FORWARD_MODE = ("gauss_newton",)  # its derivatives do not pass through a device written in Python; see its own tests
 PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1", "data.image_size=64")
