@@ -289,10 +289,10 @@ def test_what_cannot_be_resumed_is_named(commands, whole, stop):
 
 def test_a_resumed_run_keeps_its_model_though_a_later_one_is_there(commands, stop, monkeypatch):
     shutil.copytree(commands.folder / "score", commands.folder / "runs" / "train" / "early")
-    stop("default", 1, "checkpoint=null")
+    stop("default", 1, "checkpoint=latest")
     later = shutil.copytree(commands.folder / "score", commands.folder / "runs" / "train" / "later")
     os.utime(later / "checkpoints" / "last.ckpt", (time.time() + 60, time.time() + 60))
-    assert "checkpoint is runs/train/early" in commands.here("default", "eval", *EVALUATION, "checkpoint=null").error
+    assert "checkpoint is runs/train/early" in commands.here("default", "eval", *EVALUATION, "checkpoint=latest").error
     assert commands.here("unused", "eval", "resume=default").status == 0
     result = json.loads((commands.folder / "default" / "results.json").read_text())
     assert result["checkpoint"] == "runs/train/early/checkpoints/best.ckpt"

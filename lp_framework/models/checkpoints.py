@@ -67,6 +67,8 @@ def find_checkpoint(name: str | Path) -> Path:
     checkpoint file, a run's folder (its best, else its last checkpoint), a folder that `lp convert` wrote, or the id of
     such a folder on the Hugging Face hub. Raises `UserError` where there is none.
     """
+    if not isinstance(name, str | Path):
+        raise UserError(f"checkpoint={name}: give bundled weights by name (score), a file, a run's folder, or {LATEST}")
     if name in [folder.name for folder in SHIPPED.iterdir()]:
         return SHIPPED / name / WEIGHTS
     if name == LATEST:
