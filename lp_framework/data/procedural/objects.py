@@ -1,0 +1,103 @@
+"""The families of objects, and the one object that a seed and an index stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import trimesh
+from numpy.random import Generator
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from lp_framework.data.meshes import Ambiguity, MeshObject
+from lp_framework.data.procedural import crockery, furniture, groceries, things
+from lp_framework.data.procedural.shapes import Parts
+from lp_framework.data.procedural.textures import pick
+from lp_framework.data.toy.shapes import scene
+
+
+@dataclass(frozen=True)
+class Family:
+    """Objects of one kind and one ambiguity class: what `build` makes of a generator, the class included, by
+    construction. `share` weighs it against the other families."""
+
+    name: str
+    build: Callable[[Generator], Parts]
+    share: float
+    ambiguity: Ambiguity = "unique"
+    unique_answer: bool = True
+
+
+FAMILIES = (
+    Family("box", groceries.printed_box, 12, "twofold"),
+    Family("box_alike", partial(groceries.printed_box, alike=True), 1, "twofold", False),
+    Family("carton", groceries.carton, 4, "twofold"),
+    Family("flat_bottle", partial(groceries.bottle, flat=True), 6, "twofold"),
+    Family("bottle", partial(groceries.bottle, flat=False, told=True), 3, "continuous"),
+    Family("plain_bottle", partial(groceries.bottle, flat=False, told=False), 2, "continuous", False),
+    Family("tin", partial(groceries.tin, told=True), 6, "continuous"),
+    Family("plain_tin", partial(groceries.tin, told=False), 1, "continuous", False),
+    Family("square_tin", partial(groceries.tin, told=True, exponent=6.0), 2, "twofold"),
+    Family("pouch", groceries.pouch, 3, "twofold"),
+    Family("paste", groceries.paste_tube, 2),
+    Family("jug", groceries.jug, 4),
+    Family("mug", crockery.mug, 7),
+    Family("bowl", partial(crockery.bowl, told=True), 2, "continuous"),
+    Family("plain_bowl", partial(crockery.bowl, told=False), 2, "continuous", False),
+    Family("vase", partial(crockery.vase, told=True), 1.5, "continuous"),
+    Family("plain_vase", partial(crockery.vase, told=False), 1, "continuous", False),
+    Family("pan", crockery.pan, 3),
+    Family("pot", crockery.pot, 1, "twofold", False),
+    Family("teapot", crockery.teapot, 4),
+    Family("cutlery", crockery.cutlery, 2),
+    Family("cabinet", furniture.cabinet, 5),
+    Family("table", partial(furniture.table, alike=True), 1, "twofold", False),
+    Family("desk", partial(furniture.table, alike=False), 2),
+    Family("chair", furniture.chair, 3),
+    Family("sofa", furniture.sofa, 1.5),
+    Family("rack", furniture.rack, 3),
+    Family("crate", partial(furniture.container, alike=True), 1, "twofold", False),
+    Family("caddy", partial(furniture.container, alike=False), 3),
+    Family("lamp", furniture.lamp, 2),
+    Family("tap", furniture.tap, 1.5),
+    Family("book", things.book, 4),
+    Family("tool", things.tool, 4),
+    Family("plush", things.plush, 4),
+    Family("vehicle", things.vehicle, 3),
+    Family("appliance", things.appliance, 3),
+    Family("shoe", things.shoe, 1.5),
+    Family("bag", things.bag, 2),
+    Family("composition", things.composition, 6),
+)
+GOLDEN, SILVER = (5**0.5 - 1) / 2, 2**0.5 - 1
+
+
+def procedural_object(seed: int, index: int) -> MeshObject:
+    """Object `index` of the objects of `seed`, named after its family and both; the same whatever others there are."""
+    family = family_of(seed, index)
+    name = f"{family.name}_{seed}_{index:05d}"
+    return MeshObject(name, family.ambiguity, partial(procedural_scene, seed, index), family.unique_answer)
+
+
+def family_of(seed: int, index: int) -> Family:
+    """The family of an object. By multiples of the golden ratio the families come evenly, however many objects."""
+    ends = np.cumsum([family.share for family in FAMILIES])
+    place = (index * GOLDEN + seed * SILVER) % 1 * ends[-1]
+    return FAMILIES[int(np.searchsorted(ends, place, side="right"))]
+
+
+def procedural_scene(seed: int, index: int) -> trimesh.Scene:
+    """The normalised scene of an object: half of them face +Z, the others any way; all in a light of their own."""
+    random = np.random.default_rng([seed, index])
+    parts = family_of(seed, index).build(random)
+    heading = pick(random, (0.0, random.uniform(0, 360)))
+    light = random.uniform(0.7, 1.0) * random.uniform(0.9, 1.0, 3)  # brightness and tint
+    meshes = []
+    for shape, texture in parts:
+        turned = shape.turn("y", heading)
+        visual = TextureVisuals(shape.uv, PBRMaterial(baseColorTexture=texture, baseColorFactor=[*light, 1.0]))
+        meshes.append(trimesh.Trimesh(turned.vertices, turned.triangles, visual=visual, process=False))
+    return scene(*meshes)
