@@ -1,0 +1,13 @@
+"""Procedural objects without end: textured things as they stand about a house, each made from two numbers.
+
+Read from the bottom up: `textures` (colours, patterns, pictures) and `labels` (prints of packages), `shapes`, then the
+families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which picks the family. `source` is the choice
+`data=procedural`.
+"""
+
+from __future__ import annotations
+
+from lp_framework.data.procedural.objects import FAMILIES, Family, procedural_object
+from lp_framework.data.procedural.source import ProceduralData
+
+__all__ = ["FAMILIES", "Family", "ProceduralData", "procedural_object"]
