@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup check format quickstart
+.PHONY: help setup check coverage format quickstart
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/\1\t\2/' | expand -t 14
@@ -9,6 +9,9 @@ setup: ## make .venv with everything in it
 
 check: ## everything a change is judged by: format, lint, types, tests
 	@bash scripts/test.sh
+
+coverage: ## how much of the mathematics the tests run
+	@bash scripts/test.sh --cov
 
 format: setup ## put the sources in order
 	@.venv/bin/ruff format . && .venv/bin/ruff check --fix .
