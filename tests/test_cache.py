@@ -260,6 +260,7 @@ def process(tmp_path: Path, fill_body: str) -> subprocess.Popen:
     )
 
 
+@pytest.mark.heavy
 def test_processes_that_want_the_same_array_fill_it_once(tmp_path, array, fill):
     running = [process(tmp_path, "time.sleep(0.5)") for _ in range(3)]
     assert [float(each.communicate(timeout=60)[0]) for each in running] == [TRUTH.sum()] * 3
@@ -268,6 +269,7 @@ def test_processes_that_want_the_same_array_fill_it_once(tmp_path, array, fill):
     assert fill.calls == 0
 
 
+@pytest.mark.heavy
 def test_a_process_killed_while_it_fills_is_no_harm(tmp_path, array, fill):
     killed = process(tmp_path, "os.kill(os.getpid(), signal.SIGKILL)")
     assert killed.wait(timeout=60) == -signal.SIGKILL

@@ -224,6 +224,7 @@ def test_a_job_of_a_sweep_does_not_see_the_ranks_of_the_one_before(lp, jobs, mon
     assert seen == [None, None]
 
 
+@pytest.mark.heavy
 def test_jobs_of_a_sweep_in_worker_processes_know_the_plugins(lp_process, walker, write):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     write("elsewhere/tmp_worker.py", WORKER)
@@ -337,6 +338,7 @@ def test_a_setting_without_a_default_has_to_be_given(lp, jobs, walker, monkeypat
     assert lp(*DEMO, "solver=jump", "solver.height=2").status == 0
 
 
+@pytest.mark.heavy
 def test_a_mistake_in_a_process_of_its_own_leaves_no_traceback(lp_process, walker):
     finished = lp_process(*DEMO, "solver.gama=1")
     assert finished.status == 2 and "did you mean 'solver.gamma'" in finished.error

@@ -27,6 +27,7 @@ def answers(folder: Path) -> list[list[float]]:
         return [[float(row[key]) for key in ANSWER] for row in csv.DictReader(file)]
 
 
+@pytest.mark.heavy
 def test_two_processes_give_the_answers_of_one(commands):
     settings = ("solver=two_stage", "solver.refinement_steps=4", "checkpoint=./score", *DESCENT)
     one: Ran = commands.here("one", "eval", *settings)

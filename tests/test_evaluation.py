@@ -168,6 +168,7 @@ def test_the_energy_model_is_evaluated_and_may_choose_by_its_energy(commands):
     )
 
 
+@pytest.mark.heavy
 def test_a_sweep_has_a_folder_and_results_for_every_combination(commands):
     ran = commands.here(
         "unused", "eval", "--multirun", "checkpoint=./score", "protocol=per_view", "start=random", "start.count=1,2",
@@ -183,6 +184,7 @@ def test_a_sweep_has_a_folder_and_results_for_every_combination(commands):
     assert found[0, 1] != found[0.3, 1]
 
 
+@pytest.mark.heavy
 def test_two_processes_give_every_number_of_one(evaluated, commands):
     spread = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
     two = commands.process("two", "eval", "checkpoint=./score", *spread)

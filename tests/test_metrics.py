@@ -242,6 +242,7 @@ SHARE = """
 """
 
 
+@pytest.mark.heavy
 def test_two_processes_give_the_result_of_one_and_count_the_filling_up_once(tmp_path):
     given = rows(pairs=53)
     (tmp_path / "given.pickle").write_bytes(pickle.dumps((NAMES, AMBIGUITIES, UNIQUE, given)))

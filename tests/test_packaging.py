@@ -14,6 +14,7 @@ import pytest
 from omegaconf import OmegaConf
 
 pytest.importorskip("hatchling", reason="the wheels are built with hatchling, of the extra dev")
+pytestmark = pytest.mark.heavy
 
 ROOT = Path(__file__).parents[1]
 

@@ -21,10 +21,13 @@ from lp_framework.data.source import RenderingsData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.models.pose_model import ScoreModel
 
-pytestmark = pytest.mark.skipif(
-    not (torch.distributed.is_available() and torch.distributed.is_gloo_available()),
-    reason="PyTorch was built without gloo, by which processes on CPUs speak",
-)
+pytestmark = [
+    pytest.mark.heavy,
+    pytest.mark.skipif(
+        not (torch.distributed.is_available() and torch.distributed.is_gloo_available()),
+        reason="PyTorch was built without gloo, by which processes on CPUs speak",
+    ),
+]
 TEST_VIEWS = 5
 SPREAD = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
 # 80 pairs are 12 batches, the last one of 3.

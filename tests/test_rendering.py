@@ -585,6 +585,7 @@ def test_equal_names_are_refused(tmp_path):
         render_objects(objects_named("cube", "ball", "cube"), tmp_path, SMALL, FlatRenderer())
 
 
+@pytest.mark.heavy
 def test_processes_render_what_one_process_does_and_failures_are_listed_at_the_end(tmp_path):
     painted_box().export(tmp_path / "box.ply")
     vertex_coloured_torus().export(tmp_path / "torus.ply")

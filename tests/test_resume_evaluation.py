@@ -21,6 +21,7 @@ from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.journal import Journal
 from lp_framework.evaluation.metrics import SolvedBatch
 
+pytestmark = pytest.mark.heavy
 TEST_VIEWS = 5
 PAIRS = len(OBJECTS) * TEST_VIEWS * (TEST_VIEWS - 1)
 BATCH = 7  # 80 pairs are 12 batches, the last one of 3

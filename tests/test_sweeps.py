@@ -16,6 +16,7 @@ from tiny_runs import Commands, Ran
 
 from lp_framework.report.paper import paper_tables
 
+pytestmark = pytest.mark.heavy
 ROOT = Path(__file__).parents[1]
 SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2", "pictures=false")
 

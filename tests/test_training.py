@@ -104,6 +104,7 @@ def test_the_console_ends_with_the_model_and_the_next_command(score):
     assert lines[-1] == f"{evaluation} data.image_size=16 data.path=views"
 
 
+@pytest.mark.heavy
 def test_the_console_has_no_notes_and_advertisements(score, commands):
     assert score.err == ""
     assert "Tip" not in score.out
@@ -179,6 +180,7 @@ def test_the_papers_alternatives_train(commands, setting):
 # ---------------------------------------------------------------- resuming
 
 
+@pytest.mark.heavy
 def test_resuming_after_kill_9_gives_the_weights_of_an_uninterrupted_run(commands, whole, killed):
     begun = torch.load(killed / "checkpoints" / "last.ckpt", weights_only=True)
     assert 1 <= begun["epoch"] + 1 < 6  # it was killed on the way
@@ -303,6 +305,7 @@ def test_the_checkpoint_of_another_model_is_not_resumed(commands, score):
 # ---------------------------------------------------------------- two processes
 
 
+@pytest.mark.heavy
 def test_two_processes_report_the_validation_loss_of_one(commands):
     settings = ("model.learning_rate=0.0", "trainer.max_epochs=1", "data.batch_pairs=7")  # 24 pairs: 4 batches, 2 each
     one = commands.here("one", "train", *settings)

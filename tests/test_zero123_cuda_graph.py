@@ -161,6 +161,7 @@ def test_without_a_gpu_the_setting_changes_nothing():
     assert all(map(torch.equal, one, other))
 
 
+@pytest.mark.heavy
 @pytest.mark.gpu
 def test_replays_on_a_gpu():
     plain, graphed = prior_of().cuda(), prior_of(cuda_graph=True).cuda()

@@ -23,6 +23,7 @@ def test_parameter_counts():
     assert counts == PARAMETERS
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_the_full_size_runs_with_its_gradient():
     if os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") < 9e9:

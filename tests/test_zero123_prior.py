@@ -195,6 +195,7 @@ def test_settings_of_speed_change_no_number(prior, problem, checkpoint, settings
     close(other.residual(*problem), prior.residual(*problem), 1e-4)
 
 
+@pytest.mark.heavy
 @pytest.mark.slow
 def test_the_compiled_network_gives_the_same_numbers(prior, problem, checkpoint):
     other = small(Zero123(checkpoint, compile=True))

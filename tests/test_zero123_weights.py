@@ -162,6 +162,7 @@ def test_other_models_are_no_zero123(tensors, tmp_path):
     assert "no 'state_dict'" in refused(saved([torch.zeros(2)], tmp_path))
 
 
+@pytest.mark.heavy
 def test_peak_memory_is_that_of_the_weights_kept(tensors, tmp_path):
     """Weights of 240 MB beside raw ones and optimizer states of 300 MB, measured in a process of its own."""
     if not Path("/proc/self/clear_refs").exists():

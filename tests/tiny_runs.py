@@ -111,6 +111,8 @@ class Commands:
             }  # fmt: skip
             if "model=prior" not in overrides:
                 settings["model.hidden"] = "16"
+        if command == "eval":
+            settings["pictures"] = "false"  # they take most of a run's time
         if command in ("convert", "estimate", "report") or any(
             override.startswith("resume=") for override in overrides
         ):
