@@ -32,6 +32,7 @@ from lp_framework.errors import UserError, nearest, one_line
 
 log = logging.getLogger(__name__)
 
+INFO = ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]
 OPTIONS: dict[tuple[str, ...], dict[str, Any]] = {  # Hydra's, as argparse takes them
     ("--help", "-h"): {"action": "store_true"},
     ("--hydra-help",): {"action": "store_true"},
@@ -44,7 +45,7 @@ OPTIONS: dict[tuple[str, ...], dict[str, Any]] = {  # Hydra's, as argparse takes
     ("--config-path", "-cp"): {},
     ("--config-name", "-cn"): {},
     ("--config-dir", "-cd"): {},
-    ("--info", "-i"): {"nargs": "?", "const": "all"},
+    ("--info", "-i"): {"nargs": "?", "const": "all", "choices": INFO},
 }
 CONFIG_OPTIONS = ("config_dir", "config_path", "config_name")
 LAUNCHER = "hydra/launcher/"

@@ -74,7 +74,7 @@ def test_a_plugin_installed_as_a_package_is_chosen_on_the_command_line(installed
         **{"name": "color_grid", "grid": 8, "features": 128, "image_size": 64},
     }
     listing = run(installed / "lp", "plugins", cwd=tmp_path).stdout
-    assert re.search(r"^color_grid +package lp-color-grid 0\.1\.0 +grid=4, ", listing, re.MULTILINE)
+    assert re.search(r"^color_grid +package lp-color-grid 0\.1\.0 +grid=8, ", listing, re.MULTILINE)
 
 
 def test_the_wheel_has_the_weights_and_the_papers_numbers(installed, tmp_path):
