@@ -17,6 +17,7 @@ import torch
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hypothesis import settings
+from tiny_runs import Commands
 
 from lp_framework import cli, registry, torchvision_ops
 
@@ -94,6 +95,18 @@ def lp_process(tmp_path: Path) -> Callable[..., Finished]:
         return Finished(done.returncode, done.stdout, done.stderr)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a training run of a score model in `score` and of an energy model in `energy`, an epoch each."""
+    commands = Commands(tmp_path_factory.mktemp("trained"))
+    folder = tmp_path_factory.mktemp("models")
+    for model in ("score", "energy"):
+        ran = commands.here(model, "train", f"model={model}", "trainer.max_epochs=1")
+        assert ran.status == 0, ran.err
+        ran.folder.rename(folder / model)
+    return folder
 
 
 @pytest.fixture

@@ -201,7 +201,7 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
 
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", save)
     monkeypatch.setattr(Evaluation, "result", gathered)
-    there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver])
+    there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver], "pictures=true")
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
     assert gathered_on == [FAR]  # NCCL gathers what is on GPUs

@@ -14,7 +14,7 @@ def commands(tmp_path_factory) -> Commands:
 
 
 def test_without_pictures_there_are_the_same_tables_and_nothing_else(commands):
-    drawn = commands.here("drawn", "eval", *SHORT)
+    drawn = commands.here("drawn", "eval", *SHORT, "pictures=true")
     bare = commands.here("bare", "eval", *SHORT, "pictures=false")
     assert (drawn.status, bare.status) == (0, 0), (drawn.err, bare.err)
     pictures = {file.name for file in (drawn.folder / "pictures").iterdir()}

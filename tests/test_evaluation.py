@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from test_solver_contract import build
 from tiny_runs import OBJECTS, Commands, Ran
 
@@ -35,12 +34,8 @@ PAIRS = len(OBJECTS) * TEST_VIEWS * (TEST_VIEWS - 1)
 
 
 @pytest.fixture(scope="module")
-def commands(tmp_path_factory) -> Commands:
-    commands = Commands(tmp_path_factory.mktemp("evaluation"), test_views=TEST_VIEWS)
-    for model in ("score", "energy"):
-        ran = commands.here(model, "train", f"model={model}", "trainer.max_epochs=2")
-        assert ran.status == 0, ran.err
-    return commands
+def commands(tmp_path_factory, trained) -> Commands:
+    return Commands(tmp_path_factory.mktemp("evaluation"), test_views=TEST_VIEWS, trained=trained)
 
 
 @pytest.fixture(scope="module")
@@ -207,11 +202,10 @@ def test_two_processes_give_every_number_of_one(evaluated, commands):
     ("solver", "starts", "pairs"), [("ifusion", 9, 4), ("two_stage", 2, 18), ("ifusion", 100, 1), ("id_pose", 9, 7)]
 )
 def test_a_batch_of_pairs_fills_a_large_prior_and_no_more(monkeypatch, solver, starts, pairs):
-    config = OmegaConf.create({"batch_pairs": None, "seed": 0})
     built = build(solver)
-    assert pairs_at_once(config, built, Ring(starts)) == EVALUATION_PAIRS
+    assert pairs_at_once(None, built, Ring(starts)) == EVALUATION_PAIRS
     monkeypatch.setattr("lp_framework.commands.eval.LARGE", -1)
-    assert pairs_at_once(config, built, Ring(starts)) == pairs
+    assert pairs_at_once(None, built, Ring(starts)) == pairs
 
 
 def test_poses_are_not_computed_in_less_than_float32(commands):
@@ -242,8 +236,9 @@ def test_errors_compare_the_querys_predicted_camera_with_its_true_one():
 def test_a_start_that_is_not_valid_is_a_failure_wherever_it_ended():
     poses = torch.tensor([[0.1, 0.3, 1.5], [0.4, 2.0, 1.3]], dtype=torch.float64)
     batch = PairBatch(
-        pixels=None, features=None, poses=poses, cameras=camera_to_world(poses), objects=torch.zeros(2).long(),
-        reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]), pairs=torch.tensor([1, 2]),
+        pixels=None, features=None, names=["a/0", "a/1"], poses=poses, cameras=camera_to_world(poses),
+        objects=torch.zeros(2).long(), reference=torch.tensor([0, 1]), query=torch.tensor([1, 0]),
+        pairs=torch.tensor([[0, 1], [1, 0]]),
     )  # fmt: skip
     right = batch.relative_poses()[:, None].double().expand(-1, 3, -1)
     valid, chosen = torch.tensor([[True, False, True], [True, True, False]]), torch.zeros(2).long()

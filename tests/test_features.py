@@ -298,7 +298,7 @@ def test_a_learned_matcher_is_a_network_of_the_solver(tmp_path, views):
         ({"field_of_view_degrees": 180.0}, "solver.field_of_view_degrees must be between 0 and 180, got 180.0"),
         ({"reference_radius": 0.0}, "solver.reference_radius must be positive, got 0.0"),
         ({"weights": "x"}, "solver.matcher=sift has no weights, got solver.weights=x"),
-        ({"matcher": "surf"}, "matcher=surf is none of its values"),
+        ({"matcher": "surf"}, "matcher=surf does not fit; expected one of sift"),
     ],
 )
 def test_bad_settings(settings, message):

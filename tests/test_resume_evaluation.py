@@ -25,7 +25,7 @@ pytestmark = pytest.mark.heavy
 TEST_VIEWS = 5
 PAIRS = len(OBJECTS) * TEST_VIEWS * (TEST_VIEWS - 1)
 BATCH = 7  # 80 pairs are 12 batches, the last one of 3
-EVALUATION = ("checkpoint=./score", f"batch_pairs={BATCH}", "solver.iterations=5", "pictures=false")
+EVALUATION = ("checkpoint=./score", f"batch_pairs={BATCH}", "solver.iterations=5")
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from lp_framework.report.paper import paper_tables
 
 pytestmark = pytest.mark.heavy
 ROOT = Path(__file__).parents[1]
-SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2", "pictures=false")
+SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.iterations=2")
 
 
 # ---------------------------------------------------------------- experiments
@@ -101,12 +101,9 @@ def test_what_a_job_starts_again_is_the_job_and_not_the_sweep(lp, jobs, monkeypa
 
 
 @pytest.fixture(scope="module")
-def commands(tmp_path_factory) -> Commands:
+def commands(tmp_path_factory, trained) -> Commands:
     """A working folder with a trained model in `score`."""
-    commands = Commands(tmp_path_factory.mktemp("sweeps"), train_views=3, test_views=2)
-    trained = commands.here("score", "train", "trainer.max_epochs=1", "data.validation_views=0")
-    assert trained.status == 0, trained.err
-    return commands
+    return Commands(tmp_path_factory.mktemp("sweeps"), train_views=3, test_views=2, trained=trained)
 
 
 @pytest.fixture
@@ -178,7 +175,7 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
 
 def test_a_single_run_is_made_anew(commands):
     for _ in range(2):
-        ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2", "pictures=false")
+        ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2")
         assert ran.status == 0 and "skipped" not in ran.out
 
 

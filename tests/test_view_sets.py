@@ -25,11 +25,8 @@ TEST_VIEWS = 5
 
 
 @pytest.fixture(scope="module")
-def commands(tmp_path_factory) -> Commands:
-    commands = Commands(tmp_path_factory.mktemp("view_sets"), test_views=TEST_VIEWS)
-    ran = commands.here("score", "train", "model=score", "trainer.max_epochs=1")
-    assert ran.status == 0, ran.err
-    return commands
+def commands(tmp_path_factory, trained) -> Commands:
+    return Commands(tmp_path_factory.mktemp("view_sets"), test_views=TEST_VIEWS, trained=trained)
 
 
 @pytest.fixture
@@ -146,7 +143,7 @@ def test_how_many_images_there_may_be(data, views):
 
 
 def test_a_solver_of_pairs_gives_each_image_the_answer_of_its_pair(commands):
-    ran = commands.here("sets", "eval", "checkpoint=./score", "solver.gamma=0", "views=3")
+    ran = commands.here("sets", "eval", "checkpoint=./score", "solver.gamma=0", "views=3", "pictures=true")
     assert (ran.status, ran.err) == (0, "")
     ordered = commands.here("ordered", "eval", "checkpoint=./score", "solver.gamma=0")
     rows, results = pair_rows(ran), ran.json()
@@ -167,10 +164,11 @@ def test_a_solver_of_pairs_gives_each_image_the_answer_of_its_pair(commands):
 
 
 def test_the_joint_solver_from_the_command_line(commands):
-    ran = commands.here("joint", "eval", "checkpoint=./score", "solver=multiview", "views=4", "start=random")
+    settings = ("checkpoint=./score", "solver=multiview", "views=4", "start=random")
+    ran = commands.here("joint", "eval", *settings, "pictures=true")
     assert ran.status == 0, ran.err
     assert ran.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 3
-    again = commands.here("again", "eval", "checkpoint=./score", "solver=multiview", "views=4", "start=random")
+    again = commands.here("again", "eval", *settings)
     assert (again.folder / "pairs.csv").read_bytes() == (ran.folder / "pairs.csv").read_bytes()
     by_pair = {(row["object"], row["reference"], row["query"]): row for row in pair_rows(ran)}
     examples = read_examples(ran.folder / "pictures" / "examples")
@@ -183,9 +181,7 @@ def test_the_joint_solver_from_the_command_line(commands):
         assert example.trajectories is None and len(example.ends) == 1
     page = (ran.folder / "report.html").read_text()
     assert "the solver's steps were not kept" in html.unescape(page) and "slider plays" not in page
-    fit = commands.here(
-        "fit", "eval", "checkpoint=./score", "solver=multiview", "solver.second_stage=false", "views=4", "start=random"
-    )
+    fit = commands.here("fit", "eval", *settings, "solver.second_stage=false")
     assert fit.json()["seconds_per_pair"] < ran.json()["seconds_per_pair"]
 
 
@@ -197,5 +193,5 @@ def test_mistakes_are_named(commands):
         f"object '{sorted(OBJECTS)[0]}' has {TEST_VIEWS} views here; sets of views=6 need as many"
     )
     assert commands.here("x", "eval", "checkpoint=./score", "views=3", "protocol=per_view").error == (
-        "protocol=per_view is one of pairs; views=3 has its own, leave it out"
+        "protocol=per_view is for pairs; views=3 has a protocol of its own, leave it out"
     )

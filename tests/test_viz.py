@@ -426,7 +426,7 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
         assert learned.ways is not None and learned.ways.paths is not None
         assert learned.ways.paths.shape == (9, 101, 3) and learned.ways.chosen is not None
         # Solved again, the pair has the evaluation's answer.
-        answer = rows["answer"][rows["pair"] == batch.pairs[0]][0].numpy()
+        answer = rows["answer"][(rows["pair"] == batch.pairs[0]).all(dim=1)][0].numpy()
         np.testing.assert_allclose(learned.ways.ends[learned.ways.chosen], answer, atol=1e-4)
         # The arrows are the model's score at the true radius.
         assert batch.pixels is not None and learned.arrows is not None and exact.arrows is not None

@@ -7,6 +7,7 @@ import copy
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -93,10 +94,15 @@ class Ran:
 
 
 class Commands:
-    """Commands, a folder each, in a working folder with views in `views` and the tiny backbone in `plugins`."""
+    """Commands, a folder each, in a working folder with views in `views` and the tiny backbone in `plugins`.
 
-    def __init__(self, folder: Path, train_views: int = 9, test_views: int = 4) -> None:
+    The training runs in the folder `trained` are copied into it.
+    """
+
+    def __init__(self, folder: Path, train_views: int = 9, test_views: int = 4, trained: Path | None = None) -> None:
         self.folder = folder
+        if trained is not None:
+            shutil.copytree(trained, folder, dirs_exist_ok=True)
         write_objects(folder / "views", OBJECTS, train=train_views, test=test_views)
         (folder / "plugins" / "tmp_tiny").mkdir(parents=True)
         (folder / "plugins" / "tmp_tiny" / "tmp_tiny.py").write_text(textwrap.dedent(BACKBONE))

@@ -72,7 +72,7 @@ class Profile(NamedTuple):
     def minima(self) -> list[Minimum]:
         """Its local minima, the deepest first; a dent of less than `PROMINENCE` of the range does not count."""
         found = valleys(self.energy[None], PROMINENCE)
-        return [Minimum(self.degrees[valley.cell].item(), valley.height) for valley in found]
+        return [Minimum(self.degrees[cell].item(), height) for cell, height, _ in found]
 
 
 def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:

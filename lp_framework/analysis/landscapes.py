@@ -52,8 +52,8 @@ class Landscape(NamedTuple):
     def minima(self) -> list[LandscapeMinimum]:
         """Its local minima, the deepest first; see `valleys`. Places are refined by a parabola along either angle."""
         return [
-            LandscapeMinimum(*self._place(valley.cell), self.energy.flatten()[valley.cell].item(), *valley[1:])
-            for valley in valleys(self.energy, PROMINENCE)
+            LandscapeMinimum(*self._place(cell), self.energy.flatten()[cell].item(), height, prominence)
+            for cell, height, prominence in valleys(self.energy, PROMINENCE)
         ]
 
     def floor(self) -> Tensor:
@@ -88,16 +88,10 @@ def _vertex(left: float, middle: float, right: float) -> float:
     return min(max((left - right) / (2 * curvature), -0.5), 0.5) if curvature > 0 else 0.0
 
 
-class Valley(NamedTuple):
-    """The lowest point of a valley, by its number in the flattened grid; the rest as of a `LandscapeMinimum`."""
-
-    cell: int
-    height: float
-    prominence: float
-
-
-def valleys(energy: Tensor, least: float) -> list[Valley]:
+def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
     """The valleys of energies `[A, O]` whose prominence is `least` or more, the deepest first.
+
+    Of each the number of its lowest point in the flattened grid, and `height` and `prominence` as of the minimum.
 
     On a cylinder: periodic in longitude, open in latitude, so the lowest ground on a border is a valley as well (its
     bottom may lie beyond). A point has eight neighbours. Equal energies side by side are one minimum, saddles are none,
@@ -133,8 +127,8 @@ def valleys(energy: Tensor, least: float) -> list[Valley]:
         for shallower in met[1:]:
             basin[shallower] = met[0]
             climbs[shallower] = heights[cell] - heights[shallower]
-    found = [Valley(cell, (heights[cell] - low) / relief, climb / relief) for cell, climb in climbs.items()]
-    return sorted((valley for valley in found if valley.prominence >= least), key=lambda valley: heights[valley.cell])
+    found = [(cell, (heights[cell] - low) / relief, climb / relief) for cell, climb in climbs.items()]
+    return sorted((valley for valley in found if valley[2] >= least), key=lambda valley: valley[1])
 
 
 def landscape_grid(latitude_limit: float = 60.0, latitude_step: float = 8.0, longitude_step: float = 12.0) -> Grid:

@@ -157,9 +157,10 @@ def build_trainer(
     epochs = settings.get("max_epochs", 1)
     if not isinstance(epochs, int) or epochs < 0:
         raise UserError(f"trainer.max_epochs must be a number of epochs, got {epochs}")
+    arguments = registry.checked(Trainer.__init__, settings, "trainer.")
     try:
         return Trainer(
-            **registry.checked(Trainer.__init__, settings, "trainer."),
+            **arguments,
             default_root_dir=folder,
             callbacks=callbacks,
             logger=logger,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,16 +26,8 @@ from lp_framework.viz.cameras import CameraScene, camera_methods_figure
 NAMES = {"ifusion": "iFusion", "id_pose": "ID-Pose", "two_stage": "two-stage"}  # as papers write them
 
 
-class CameraContents(NamedTuple):
-    """A scene an object, the methods' names as they are read, and the field of view (radians)."""
-
-    scenes: list[CameraScene]
-    methods: list[str]
-    field_of_view: float
-
-
 @register("figure", "cameras")
-class CamerasFigure(PaperFigure[CameraContents]):
+class CamerasFigure(PaperFigure[list[CameraScene]]):
     """True and predicted cameras around some objects, methods side by side, from a few random starts for each view.
 
     The first test view of an object is the reference, the next `targets`, or all that there are, are estimated.
@@ -57,13 +48,13 @@ class CamerasFigure(PaperFigure[CameraContents]):
         if not objects or not methods or targets < 1 or starts < 1:
             raise UserError("figure.objects and figure.methods need a name each, targets and starts at least 1")
         self.data, self.prior, self.objects, self.targets = data, prior, list(objects), targets
-        self.methods = list(methods)
+        self.methods, self.named = list(methods), [NAMES.get(name, words(name)) for name in methods]
         wanted = {part for name in methods for part in registry.component_names(registry.get("solver", name))}
         self.model = score_model(score) if "model" in wanted else None
         self.solvers = {name: registry.build("solver", name, prior=prior, model=self.model) for name in methods}
         self.starts = registry.build("start", {"name": "random", "count": starts})
 
-    def analyse(self, seed: int, device: torch.device) -> CameraContents:
+    def analyse(self, seed: int, device: torch.device) -> list[CameraScene]:
         """All objects and views are solved together, a method after the other."""
         views = [self.data.table("test").objects[object_index(self.data, name)] for name in self.objects]
         targets = max(1, min(self.targets, *(len(each) - 1 for each in views)))
@@ -82,24 +73,25 @@ class CamerasFigure(PaperFigure[CameraContents]):
                     first.title,
                     np.stack([first.reference.image, *(pair.query.image for pair in shown[own])]),
                     each.poses[: targets + 1].numpy(),
+                    each.field_of_view,
                     np.asarray(read_image(each.files[0]).convert("RGBA")),
                     [np.stack([predicted(pair) for pair in method]) for method in methods],
                     [f"{(near <= NEAR_DEGREES).sum()} of {len(near)} within {NEAR_DEGREES:g}°" for near in errors],
                 )
             )
-        return CameraContents(scenes, [NAMES.get(name, words(name)) for name in self.methods], views[-1].field_of_view)
+        return scenes
 
-    def draw(self, contents: CameraContents) -> Figure:
+    def draw(self, contents: list[CameraScene]) -> Figure:
         """See `viz.cameras`."""
-        return camera_methods_figure(*contents)
+        return camera_methods_figure(contents, self.named)
 
-    def caption(self, contents: CameraContents) -> str:
+    def caption(self, contents: list[CameraScene]) -> str:
         """See `PaperFigure`."""
-        names = ", ".join(scene.title for scene in contents.scenes)
+        names = ", ".join(scene.title for scene in contents)
         return (
-            f"Predicted (thin) and true cameras (bold) of {len(contents.scenes[0].images) - 1} views of each object "
+            f"Predicted (thin) and true cameras (bold) of {len(contents[0].images) - 1} views of each object "
             f"({names}), relative to the reference (red), from {self.starts.count} random starts for each view: "
-            f"{' and '.join(contents.methods)}. Counted are the predictions within {NEAR_DEGREES:g} degrees."
+            f"{' and '.join(self.named)}. Counted are the predictions within {NEAR_DEGREES:g} degrees."
         )
 
 

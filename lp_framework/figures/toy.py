@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from matplotlib.figure import Figure
@@ -31,15 +30,11 @@ from lp_framework.viz.panels import toy_figure
 SPACING = 20.0  # degrees, of arrows
 
 
-class ToyContents(NamedTuple):
-    """A pair with four maps of score fields, and exp(-E) of the prior's and the energy model's energy by title."""
-
-    pair: ShownPair
-    densities: dict[str, Landscape]
+Contents = tuple[ShownPair, dict[str, Landscape]]
 
 
 @register("figure", "toy")
-class ToyFigure(PaperFigure[ToyContents]):
+class ToyFigure(PaperFigure[Contents]):
     """The seven panels of the Toy Example: score fields and densities of one pair, exact, learned and of the prior.
 
     The pair are two test views of `object`, by number. `score` and `energy` are training runs or checkpoints; None
@@ -63,8 +58,11 @@ class ToyFigure(PaperFigure[ToyContents]):
         self.object, self.places = object, (reference, query)
         self.energy, self.score = energy_model(energy), score_model(score)
 
-    def analyse(self, seed: int, device: torch.device) -> ToyContents:
-        """Arrows and densities, all at the true relative radius; models and the exact field share the arrows' scale."""
+    def analyse(self, seed: int, device: torch.device) -> Contents:
+        """A pair with four maps of score fields, and exp(-E) of both energies by title, at the true relative radius.
+
+        The models' arrows are in the scale of the exact field.
+        """
         pairs, shown = named_pairs(self.data, [self.object], [self.places], device)
         truth, draws = truths(shown), self.draws._replace(seed=seed)
         radius, grid, cells = truth[:, 2], landscape_grid(), cell_grid(SPACING)
@@ -85,13 +83,13 @@ class ToyFigure(PaperFigure[ToyContents]):
             PoseMap("energy model, \u2212\u2207E", arrows=energy._replace(scale=scale)),
         ]
         densities = {"prior, exp(\u2212E)": landscape.density(), "energy model, exp(\u2212E)": learned.density()}
-        return ToyContents(replace(shown[0], maps=maps), densities)
+        return replace(shown[0], maps=maps), densities
 
-    def draw(self, contents: ToyContents) -> Figure:
+    def draw(self, contents: Contents) -> Figure:
         """See `viz.panels`."""
         return toy_figure(*contents)
 
-    def caption(self, contents: ToyContents) -> str:
+    def caption(self, contents: Contents) -> str:
         """See `PaperFigure`."""
         return (
             f"(a) Reference and query, {words(self.object)}; (b) exact score field; (c) of the score model; (d) of the "

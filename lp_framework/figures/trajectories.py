@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from matplotlib.figure import Figure
@@ -23,16 +22,8 @@ from lp_framework.solvers.starts import Ring
 from lp_framework.viz.panels import trajectories_figure
 
 
-class TrajectoryContents(NamedTuple):
-    """A pair, and views `[N, K, H, W, 3]` that the prior generates at some steps of each trajectory."""
-
-    pair: ShownPair
-    views: NDArray
-    steps: list[int]
-
-
 @register("figure", "trajectories")
-class TrajectoriesFigure(PaperFigure[TrajectoryContents]):
+class TrajectoriesFigure(PaperFigure[tuple[ShownPair, NDArray]]):
     """iFusion's ways from longitudes 0, 90, 180 and 270 over the prior's landscape, and views generated on them.
 
     The pair are two test views of `object`, by number. Each way has `views` generated views, the first at its start and
@@ -63,8 +54,8 @@ class TrajectoriesFigure(PaperFigure[TrajectoryContents]):
         self.steps = [round(steps * (place / (views - 1)) ** 2) for place in range(views)]  # most happens at first
         self.sampling = (sampling_steps, guidance)
 
-    def analyse(self, seed: int, device: torch.device) -> TrajectoryContents:
-        """The pair is solved once, from all starts together."""
+    def analyse(self, seed: int, device: torch.device) -> tuple[ShownPair, NDArray]:
+        """The pair, solved once from all starts, and views `[N, K, H, W, 3]` at `steps` of each trajectory."""
         pairs, shown = named_pairs(self.data, [self.object], [self.places], device)
         with shown_progress():
             shown = solved_pairs(pairs, shown, self.solver, Ring().make(pairs, seed), seed)
@@ -74,13 +65,13 @@ class TrajectoriesFigure(PaperFigure[TrajectoryContents]):
             with torch.no_grad():
                 source = self.prior.encode(pairs.images[pairs.reference])
             views = generated_views(self.prior, source, poses.flatten(0, 1), *self.sampling, seed)
-        return TrajectoryContents(pair, views.reshape(*poses.shape[:2], *views.shape[1:]), self.steps)
+        return pair, views.reshape(*poses.shape[:2], *views.shape[1:])
 
-    def draw(self, contents: TrajectoryContents) -> Figure:
+    def draw(self, contents: tuple[ShownPair, NDArray]) -> Figure:
         """See `viz.panels`."""
-        return trajectories_figure(*contents)
+        return trajectories_figure(*contents, self.steps)
 
-    def caption(self, contents: TrajectoryContents) -> str:
+    def caption(self, contents: tuple[ShownPair, NDArray]) -> str:
         """See `PaperFigure`."""
         return (
             f"(a) Reference and (b) query, {words(self.object)}. (c) Views that the prior generates from the reference "

@@ -248,25 +248,23 @@ IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
 
 
 class CameraScene(NamedTuple):
-    """One object: images `[V, H, W, 3]` (uint8) and view poses `[V, 3]`, of which the first is the reference's; its
-    cut-out `[S, S, 4]` (RGBA, uint8); and of each method the predicted view poses `[V - 1, N, 3]` of the others from N
-    starts, with a word on how good they are.
+    """One object: images `[V, H, W, 3]` (uint8) and view poses `[V, 3]`, of which the first is the reference's, and
+    their field of view (radians); its cut-out `[S, S, 4]` (RGBA, uint8); and of each method the predicted view poses
+    `[V - 1, N, 3]` of the others from N starts, with a word on how good they are.
     """
 
     title: str
     images: NDArray
     poses: NDArray
+    field_of_view: float
     cutout: NDArray
     predicted: Sequence[NDArray]
     words: Sequence[str]
 
 
 @styled
-def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str], field_of_view: float) -> Figure:
-    """A row an object: its images, the reference framed in red, and a scene a method. `field_of_view` in radians.
-
-    The true cameras are bold, the predicted ones thin.
-    """
+def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]) -> Figure:
+    """A row an object: its images, the reference framed in red, and a scene a method; true cameras are bold."""
     wide = (METHODS_WIDTH - 2 * SIDE - IMAGES - APART * len(methods)) / len(methods)
     rows = []
     for each in objects:
@@ -285,7 +283,7 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
         for number, (poses, word) in enumerate(zip(each.predicted, each.words, strict=True)):
             x = SIDE + IMAGES + APART + number * (wide + APART)
             scene.begin(sheet.axes(x, top, wide, tall))
-            _draw_method(scene, each, poses, field_of_view / 2)
+            _draw_method(scene, each, poses)
             if row == 0:
                 sheet.above(x, top, letter(number + 1, methods[number]))
             sheet.above(x + wide, top, word, ha="right", **ASIDE)
@@ -301,9 +299,9 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
     return sheet.figure
 
 
-def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray, half_angle: float) -> None:
+def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray) -> None:
     """The cut-out in the middle, the true cameras and those predicted, `[V - 1, N, 3]`."""
-    cameras = _cameras(content.poses)
+    cameras, half_angle = _cameras(content.poses), content.field_of_view / 2
     scene.image(shrunk(content.cutout), image_plane(cameras[0], float(content.poses[0, 2]), half_angle), order=10.0)
 
     def draw(camera: NDArray, kind: str, index: int, order: float, **line: Any) -> None:

@@ -96,15 +96,9 @@ class Sheet:
     def legend(self, keys: Sequence[Line2D], x: float, y: float, **style: Any) -> None:
         """A key in one row, its upper right corner at (x, y)."""
         place = (x / self.width, 1 - y / self.height)
-        layout = {"ncols": len(keys), "columnspacing": 1.3, "handletextpad": 0.3, "handlelength": 1.4}
-        self.figure.legend(
-            handles=keys,
-            loc="upper right",
-            bbox_to_anchor=place,
-            borderaxespad=0.0,
-            borderpad=0.0,
-            **{**layout, **style},
-        )
+        layout = {"loc": "upper right", "ncols": len(keys), "borderaxespad": 0.0, "borderpad": 0.0}
+        spaces = {"columnspacing": 1.3, "handletextpad": 0.3, "handlelength": 1.4}
+        self.figure.legend(handles=keys, bbox_to_anchor=place, **{**layout, **spaces, **style})
 
 
 def degrees(axes: Axes, which: Literal["x", "y"], step: float) -> None:

@@ -62,15 +62,14 @@ def running_mean(values: NDArray, window: int) -> NDArray:
 @styled
 def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
     """The losses by their logged names on a log scale, and below them the learning rate where there is one."""
-    figure = Figure(figsize=(8.0, 3.8 if rate is not None else 3.0), layout="constrained")
-    if rate is None:
-        above, panels = figure.subplots(), []
-    else:
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3.2, 1])
-        below.plot(*rate, color=INK, linewidth=1.2)
-        below.set(ylabel="learning rate", ylim=(0, None))
-        below.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
-        panels = [below]
+    heights = [3.2] if rate is None else [3.2, 1.0]
+    figure = Figure(figsize=(8.0, 3.0 if rate is None else 3.8), layout="constrained")
+    panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    above = panels[0]
+    if rate is not None:
+        panels[1].plot(*rate, color=INK, linewidth=1.2)
+        panels[1].set(ylabel="learning rate", ylim=(0, None))
+        panels[1].ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
     drawn = []
     for name, curve in losses.items():
         colour, label = LOSSES.get(name, (MUTED, name))
@@ -98,9 +97,9 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
     above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     above.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     above.yaxis.set_minor_locator(NullLocator())
-    for axes in (above, *panels):
+    for axes in panels:
         open_frame(axes)
         axes.set_xlim(0, max(curve.step.max() for curve in losses.values()))
     above.legend(loc="lower left")
-    (panels or [above])[-1].set_xlabel("training step")
+    panels[-1].set_xlabel("training step")
     return figure
