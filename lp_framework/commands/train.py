@@ -164,16 +164,18 @@ def callbacks(config: DictConfig, folder: Path, recipe: dict[str, Any]) -> list[
         chosen.append(EMAWeightAveraging(decay=config.ema))
     if validated and config.patience is not None:
         chosen.append(EarlyStopping("val/loss", patience=config.patience))
-    chosen.append(
-        ModelCheckpoint(
-            folder / FOLDER,
-            monitor="val/loss" if validated else None,
-            filename=Path(BEST).stem,
-            save_last=True,
-            enable_version_counter=False,
-            save_on_train_epoch_end=True,
+    # A callback each: with `save_last` the last epoch would be kept only where it is the best one, too.
+    for file, monitor, mode in ((BEST, "val/loss" if validated else None, "min"), (LAST, "epoch", "max")):
+        chosen.append(
+            ModelCheckpoint(
+                folder / FOLDER,
+                monitor=monitor,
+                mode=mode,
+                filename=Path(file).stem,
+                enable_version_counter=False,
+                save_on_train_epoch_end=True,
+            )
         )
-    )
     return chosen
 
 
