@@ -1,7 +1,8 @@
 """Random draws keyed by what they belong to (seed, pair, start, step), not by when they are drawn.
 
 A counter-based generator: the value at a key is a hash of the key. So any batching, order, number of processes
-or resumption gives the same draws, and a GPU draws what a CPU draws.
+or resumption gives the same draws. All are made on the CPU, so that they are the same for every device, and none needs
+float64 there; keys may be anywhere, but to fetch them waits for their device.
 """
 
 from __future__ import annotations
@@ -38,14 +39,22 @@ def _mix(bits: Tensor) -> Tensor:
     return bits ^ _shift(bits, 31)
 
 
+def on_cpu(keys: Tensor) -> Tensor:
+    """Keys where draws are made; on the meta device they have no values, and are 0."""
+    return torch.zeros(keys.shape, dtype=keys.dtype) if keys.is_meta else keys.cpu()
+
+
+def to_device(draws: Tensor, device: torch.device) -> Tensor:
+    """Draws on a device, without waiting for what it has to do, where it can be trusted with that (Apple's cannot)."""
+    return draws.to(device, non_blocking=device.type not in ("cpu", "mps"))
+
+
 def keyed_bits(*keys: Tensor | int, count: int) -> Tensor:
     """Random int64 bits `[..., count]` for integer keys that broadcast to `[...]`."""
-    device = next((key.device for key in keys if isinstance(key, Tensor)), None)
-    state = torch.zeros((), dtype=torch.int64, device=device)
+    state = torch.zeros((), dtype=torch.int64)
     for key in keys:
-        state = _mix(state * 3 + torch.as_tensor(key, dtype=torch.int64, device=device) + _GOLDEN)
-    steps = torch.arange(1, count + 1, dtype=torch.int64, device=device) * _GOLDEN
-    return _mix(state[..., None] + steps)
+        state = _mix(state * 3 + (on_cpu(key) if isinstance(key, Tensor) else key) + _GOLDEN)
+    return _mix(state[..., None] + torch.arange(1, count + 1) * _GOLDEN)
 
 
 def keyed_uniform(*keys: Tensor | int, count: int) -> Tensor:

@@ -41,8 +41,9 @@ PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1"
 
 
 @pytest.fixture(autouse=True)
-def device() -> Iterator[None]:
-    with pretended():
+def device(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where commands run, it has no float64, as Apple's GPUs have none."""
+    with pretended(double="chosen" not in request.fixturenames):
         yield
 
 
@@ -67,6 +68,19 @@ def test_the_device_is_apart_from_the_cpu_as_a_gpu_is():
     torch.tensor([1.0], device=FAR)
     here.to(FAR)
     assert Waits.count == 4
+
+
+def test_the_device_can_do_without_float64():
+    with pretended(double=False):
+        for make in (
+            lambda: torch.ones(3, dtype=torch.float64, device=FAR),
+            lambda: torch.ones(3, dtype=torch.float64).to(FAR),
+            lambda: torch.ones(3, device=FAR).double(),
+            lambda: torch.ones(3, device=FAR) * torch.ones((), dtype=torch.float64).to(FAR),
+        ):
+            with pytest.raises(TypeError, match=r"has no torch\.float64"):
+                make()
+        assert torch.ones(3, dtype=torch.float64).to(FAR, torch.float32).cpu().double().sum() == 3
 
 
 # ---------------------------------------------------------------- priors
@@ -204,7 +218,7 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
     there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver], "pictures=true")
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
-    assert gathered_on == [FAR]  # NCCL gathers what is on GPUs
+    assert gathered_on == [torch.device("cpu")]  # it is float64
     assert drawn_on == [FAR]
 
 

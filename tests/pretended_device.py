@@ -1,8 +1,8 @@
 """A pretended accelerator, `far`: its tensors are CPU tensors that mix with those of the CPU no more than a GPU's do.
 
 Where there is no GPU it shows what would fail on one: a tensor made in the wrong place, an array of the device's
-memory, a network that was left behind. And it counts when the host waits for the device. Importing this module sets
-PyTorch's third-party device up, for the whole process.
+memory, a network that was left behind. And it counts when the host waits for the device. On request it refuses float64,
+as Apple's GPUs do. Importing this module sets PyTorch's third-party device up, for the whole process.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class FarTensor(Tensor):
 
     @staticmethod
     def __new__(cls, near: Tensor) -> FarTensor:
+        if near.dtype in Refused.dtypes:
+            raise TypeError(f"far:0 has no {near.dtype}; use float32 there")
         made = Tensor._make_wrapper_subclass(
             cls, near.shape, strides=near.stride(), storage_offset=near.storage_offset(), dtype=near.dtype, device=FAR
         )
@@ -70,6 +72,12 @@ class FarTensor(Tensor):
         return _compute(operator, args, kwargs or {})
 
 
+class Refused:
+    """What tensors on the device cannot be made of."""
+
+    dtypes: tuple[torch.dtype, ...] = ()
+
+
 class Waits:
     """How often the host has waited for the device: to read a value there, or to copy one there from its own memory."""
 
@@ -77,8 +85,9 @@ class Waits:
 
 
 @contextmanager
-def pretended() -> Iterator[None]:
-    """Within it tensors can be made on `FAR` and moved there."""
+def pretended(double: bool = True) -> Iterator[None]:
+    """Within it tensors can be made on `FAR` and moved there; without `double` none of float64."""
+    Refused.dtypes = () if double else (torch.float64, torch.complex128)
     overwrite = torch.__future__.get_overwrite_module_params_on_conversion()
     torch.__future__.set_overwrite_module_params_on_conversion(True)  # else a parameter keeps the `near` that it has
     try:
@@ -86,6 +95,7 @@ def pretended() -> Iterator[None]:
             yield
     finally:
         torch.__future__.set_overwrite_module_params_on_conversion(overwrite)
+        Refused.dtypes = ()
 
 
 class _Mode(TorchDispatchMode):
@@ -95,12 +105,13 @@ class _Mode(TorchDispatchMode):
 
 def _compute(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """An operation on tensors of either device, none of them on both."""
-    if torch.is_inference_mode_enabled():  # there operations that are made of others come as they are
+    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+    # In inference mode, and of tensors from there, operations that are made of others come as they are.
+    if torch.is_inference_mode_enabled() or any(each.is_inference() for each in tensors):
         with _Mode():
             made = operator.decompose(*args, **kwargs)
         if made is not NotImplemented:
             return made
-    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
     far, near = ([each for each in tensors if isinstance(each, FarTensor) == there] for there in (True, False))
     asked = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
     if not far and asked != FAR.type:
@@ -108,7 +119,8 @@ def _compute(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     if far and operator not in COPIES | INDEXING and any(each.ndim for each in near):  # a number may come along
         raise RuntimeError(f"{operator}: expected all tensors to be on the same device, but found far:0 and cpu")
     leaves = operator is aten._to_copy.default and asked not in (None, FAR.type)
-    Waits.count += operator is aten._local_scalar_dense.default or leaves or (operator in COPIES and bool(near))
+    arrives = operator in COPIES and bool(near) and not kwargs.get("non_blocking")
+    Waits.count += operator is aten._local_scalar_dense.default or leaves or arrives
     made = AT_ONCE.get(operator, operator)(*tree_map(_near, args), **tree_map(_near, kwargs))
     if leaves:
         return made

@@ -97,6 +97,12 @@ def test_uniform_draws_do_not_depend_on_how_many_are_drawn():
     assert torch.equal(keyed_uniform(1, 2, count=9)[:4], keyed_uniform(1, 2, count=4))
 
 
+@pytest.mark.parametrize("draw", [keyed_bits, keyed_uniform, keyed_normal])
+def test_draws_are_on_the_cpu_wherever_the_keys_are(draw):
+    drawn = draw(0, torch.arange(3, device="meta")[:, None], torch.arange(2), count=4)
+    assert drawn.device == torch.device("cpu") and drawn.shape == (3, 2, 4)
+
+
 def test_the_global_generator_is_left_alone():
     torch.manual_seed(0)
     expected = torch.rand(3)

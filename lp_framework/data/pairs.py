@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,10 +25,10 @@ class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
     `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, ...]` that a frozen backbone computed from them; `names` of the
-    views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth); `objects` `[I]`;
-    `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table. Where they are asked
-    for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]` (float32) along the optical axis in scene units, 0 where
-    there is nothing.
+    views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth, always on the CPU);
+    `objects` `[I]`; `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table. Where
+    they are asked for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]` (float32) along the optical axis in scene
+    units, 0 where there is nothing.
     """
 
     pixels: Tensor | None
@@ -41,6 +42,7 @@ class PairBatch:
     pairs: Tensor
     alpha: Tensor | None = None
     depth: Tensor | None = None
+    relative: Tensor | None = None  # see `relative_poses`, once the batch has gone to a device
 
     def __len__(self) -> int:
         return len(self.reference)
@@ -59,8 +61,19 @@ class PairBatch:
         return as_images(self.pixels)
 
     def relative_poses(self) -> Tensor:
-        """True relative poses `[P, 3]`, float32."""
+        """True relative poses `[P, 3]`, float32, where the pairs are."""
+        if self.relative is not None:
+            return self.relative
         return relative_pose(self.poses[self.reference], self.poses[self.query]).float()
+
+    def to(self, device: torch.device) -> PairBatch:
+        """The batch on a device, but for the truth: `poses` and `cameras` are float64, which not every device has."""
+        moved: dict[str, Any] = {
+            name: value.to(device)
+            for name, value in vars(self).items()
+            if isinstance(value, Tensor) and name not in ("poses", "cameras")
+        }
+        return replace(self, **moved | {"relative": self.relative_poses().to(device)})
 
 
 class ViewTable:

@@ -89,12 +89,12 @@ class Evaluation(LightningModule):
         solution = self.solve(batch)
         rotation, translation = errors(solution, batch)
         solved = SolvedBatch(
-            pair=batch.pairs,
-            object=batch.objects[batch.reference],
+            pair=batch.pairs.cpu(),
+            object=batch.objects[batch.reference].cpu(),
             rotation=rotation.double(),
             translation=translation.double(),
-            chosen=solution.chosen,
-            answer=solution.answer().double(),
+            chosen=solution.chosen.cpu(),
+            answer=solution.answer().cpu().double(),
             seconds=solution.cost.seconds,
             passes=solution.cost.network_passes,
         )
@@ -113,18 +113,20 @@ class Evaluation(LightningModule):
 
 
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
-    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one.
+    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one, float64
+    on the CPU.
 
     Full cameras are taken at the scale that suits each best (the paper's Details of Baseline Settings). A start that is
     not valid has no error but NaN, which the metrics count as a failure.
     """
-    true = batch.cameras[batch.query][:, None]
+    reference, query = batch.reference.cpu(), batch.query.cpu()
+    true = batch.cameras[query][:, None]
     if solution.cameras is None:
-        reference = batch.poses[batch.reference][:, None].double()
-        predicted = camera_to_world(apply_relative_pose(reference, solution.poses.double()))
+        pose = batch.poses[reference][:, None].double()
+        predicted = camera_to_world(apply_relative_pose(pose, solution.poses.cpu().double()))
     else:
-        camera = batch.cameras[batch.reference][:, None]
-        predicted = camera @ at_optimal_scale(solution.cameras.double(), relative_camera(camera, true))
-    true, invalid = true.expand_as(predicted), ~solution.valid
+        camera = batch.cameras[reference][:, None]
+        predicted = camera @ at_optimal_scale(solution.cameras.cpu().double(), relative_camera(camera, true))
+    true, invalid = true.expand_as(predicted), ~solution.valid.cpu()
     rotation, translation = rotation_error(predicted, true), translation_error(predicted, true)
     return rotation.masked_fill(invalid, torch.nan), translation.masked_fill(invalid, torch.nan)

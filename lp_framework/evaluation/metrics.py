@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from lp_framework.models.pair_mean import first_of_each
+from lp_framework.models.pair_mean import HostMetric, first_of_each
 
 ROTATION_THRESHOLDS = (5, 15, 30)  # degrees
 TRANSLATION_THRESHOLD = 0.2  # in units of the object's longest side
@@ -82,14 +81,13 @@ def median(values: Tensor) -> float:
     return ordered[middle].item() if len(ordered) % 2 else ordered[middle - 1 : middle + 1].mean().item()
 
 
-class PoseMetrics(Metric):
+class PoseMetrics(HostMetric):
     """Gathers a row a pair; `compute` gives the metrics overall, over objects with a unique answer, per object, and
     per ambiguity class.
 
     `names`, `ambiguities` and `unique_answer` describe the objects by index; `unique_answer` is None where unknown.
     """
 
-    full_state_update = False
     pair: list[Tensor]
     object: list[Tensor]
     rotation: list[Tensor]
@@ -125,7 +123,7 @@ class PoseMetrics(Metric):
         return self._gathered() if self._all_rows is None else self._all_rows
 
     def _gathered(self) -> dict[str, Tensor]:
-        rows = {state: dim_zero_cat(getattr(self, state)).cpu() for state in STATES}
+        rows = {state: dim_zero_cat(getattr(self, state)) for state in STATES}
         order = first_of_each(rows["pair"])
         return {state: value[order] for state, value in rows.items()}
 
@@ -158,10 +156,9 @@ class PoseMetrics(Metric):
         }
 
 
-class Costs(Metric):
+class Costs(HostMetric):
     """Pairs, seconds and network passes of batches that count once each, however many processes met one."""
 
-    full_state_update = False
     batch: list[Tensor]
     cost: list[Tensor]
 
@@ -173,10 +170,10 @@ class Costs(Metric):
     def update(self, pair: Tensor, seconds: float, passes: int) -> None:
         """Add a batch of pairs `[P, 2]`."""
         self.batch.append(pair[:1])
-        self.cost.append(torch.tensor([[len(pair), seconds, passes]], dtype=torch.float64, device=pair.device))
+        self.cost.append(torch.tensor([[len(pair), seconds, passes]], dtype=torch.float64))
 
     def compute(self) -> dict[str, float]:
         """Their sums: `pairs`, `seconds`, `passes`."""
-        batch, cost = dim_zero_cat(self.batch).cpu(), dim_zero_cat(self.cost).cpu()
+        batch, cost = dim_zero_cat(self.batch), dim_zero_cat(self.cost)
         pairs, seconds, passes = cost[first_of_each(batch)].sum(dim=0).tolist()
         return {"pairs": pairs, "seconds": seconds, "passes": passes}

@@ -28,7 +28,7 @@ class ViewSetEvaluation(Evaluation):
         pairs = pairs_of(batch, self.device)
         ids = pairs.ids.view(-1, self.others)
         views = torch.cat([pairs.reference.view_as(ids)[:, :1], pairs.query.view_as(ids)], dim=1)
-        view_sets = ViewSets(pairs.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0])
+        view_sets = ViewSets(pairs.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0].to(ids.device))
         starts = self.starts.make(pairs, self.seed).unflatten(0, (-1, self.others))
         solution = self.solver.solve_views(view_sets, starts, self.seed)
         poses = solution.poses.flatten(0, 1)[:, None]

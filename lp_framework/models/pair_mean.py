@@ -1,11 +1,11 @@
-"""The mean of a value a pair has, counted once a pair whatever the number of processes."""
+"""Metrics on the CPU, and the mean of a value that each pair has, counted once whatever the number of processes."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
@@ -21,10 +21,29 @@ def first_of_each(pairs: Tensor) -> Tensor:
     return first.scatter_reduce(0, place, torch.arange(len(pairs), device=pairs.device), "amin")
 
 
-class PairMean(Metric):
-    """Mean over pairs; several processes pad their share with repeated pairs, which count once."""
+class HostMetric(Metric):
+    """A metric whose states stay on the CPU wherever its module goes: they are float64, which not every device has."""
 
     full_state_update = False
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(dist_sync_fn=gathered, **arguments)
+
+    def _apply(self, *_: Any, **__: Any) -> HostMetric:
+        """Called by `torch.nn.Module` to move it."""
+        return self
+
+
+def gathered(value: Tensor, group: Any = None) -> list[Tensor]:
+    """`value` of every process; as an object, since a GPU's backend exchanges no tensors of the CPU."""
+    values = [value] * distributed.get_world_size(group)
+    distributed.all_gather_object(values, value, group=group)
+    return values
+
+
+class PairMean(HostMetric):
+    """Mean over pairs; several processes pad their share with repeated pairs, which count once."""
+
     pair: list[Tensor]
     value: list[Tensor]
 
@@ -35,8 +54,8 @@ class PairMean(Metric):
 
     def update(self, pair: Tensor, value: Tensor) -> None:
         """Add values `[P]` (float64 inside) of pairs with these ids `[P]`."""
-        self.pair.append(pair)
-        self.value.append(value.double())
+        self.pair.append(pair.cpu())
+        self.value.append(value.detach().cpu().double())
 
     def compute(self) -> Tensor:
         """The mean, float32 scalar."""

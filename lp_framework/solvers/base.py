@@ -71,9 +71,9 @@ class ViewSets:
 
         Their ids are keyed by the set's id and the two places.
         """
-        places = torch.tensor([list(reference), list(query)], device=self.views.device)
-        ids = keyed_bits(self.ids[:, None], *places, count=1)
-        chosen = self.views[:, places]  # [S, 2, P]
+        places = torch.tensor([list(reference), list(query)])
+        ids = keyed_bits(self.ids[:, None], *places, count=1).to(self.ids.device)
+        chosen = self.views[:, places.to(self.views.device)]  # [S, 2, P]
         return Pairs(self.images, chosen[:, 0].flatten(), chosen[:, 1].flatten(), ids.flatten())
 
 

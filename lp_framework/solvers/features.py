@@ -71,7 +71,7 @@ class Features(RelativeCameraSolver):
         draws = keyed_bits(seed, pairs.ids, count=1)[:, 0] & 0x7FFFFFFF
         cameras = torch.full((len(pairs), 4, 4), torch.nan, dtype=torch.float64)
         energies = torch.full((len(pairs),), torch.nan, dtype=torch.float64)
-        problems = torch.stack([pairs.reference, pairs.query, draws], dim=1).tolist()
+        problems = torch.stack([pairs.reference.cpu(), pairs.query.cpu(), draws], dim=1).tolist()
         for number, (reference, query, draw) in enumerate(problems):
             matches = self.matcher.match(seen[reference], seen[query])
             found = self.relative_camera(matches, width, draw)

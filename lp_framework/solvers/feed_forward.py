@@ -50,7 +50,7 @@ class FeedForward(RelativeCameraSolver):
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
         """See `RelativeCameraSolver.predict`; these have no energies, all are 0."""
         ends = torch.stack([pairs.reference, pairs.query], dim=1)
-        both = torch.stack([self.cameras(self.prepare(pairs.images[pair])).double().cpu() for pair in ends])
+        both = torch.stack([self.cameras(self.prepare(pairs.images[pair])).cpu().double() for pair in ends])
         reference, query = from_opencv(both).unbind(dim=1)
         energies = torch.zeros(len(pairs), dtype=torch.float64)
         return relative_camera(reference, query), energies, self.passes_per_pair * len(pairs)
@@ -118,7 +118,7 @@ class VGGT(FeedForward):
             tokens, _ = network.aggregator(batch)
         encoded = network.camera_head(tokens)[-1]  # of the last refinement
         world_to_camera, _ = self.encoding.pose_encoding_to_extri_intri(encoded, batch.shape[-2:])
-        matrices = world_to_camera[0].double()  # [2, 3, 4]
+        matrices = world_to_camera[0].cpu().double()  # [2, 3, 4]
         return inverse(rigid_transform(matrices[..., :3], matrices[..., 3]))
 
 

@@ -21,7 +21,7 @@ from torch.nn.functional import one_hot, pad
 from lp_framework.clock import now
 from lp_framework.errors import check_settings
 from lp_framework.geometry import reduce_longitude
-from lp_framework.keyed_random import keyed_uniform
+from lp_framework.keyed_random import keyed_uniform, on_cpu
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, check_starts, choose
@@ -224,15 +224,15 @@ class IDPose(Solver):
 
     def refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, selected: Tensor) -> Refined:
         """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step."""
-        others = selected.shape[1]
+        others, keys = selected.shape[1], on_cpu(ids)
         cycle = [pair for duo in combinations(range(others + 1), 2) for pair in (duo, duo[::-1])]  # (source, target)
-        moved = self._moved(cycle, ids, energy.seed, others)  # [steps, S, V]
+        moved = self._moved(cycle, keys, energy.seed, others).to(ids.device)  # [steps, S, V]
 
         def one_pair(flat: Tensor, step: int) -> Tensor:
             source, target = cycle[step % len(cycle)]
             poses = pad(flat.unflatten(2, (others, 3)), (0, 0, 1, 0))[:, 0]  # [S, V, 3], the first image's is 0
             poses = torch.where(moved[step][..., None], poses, poses.detach())
-            noise = keyed_noise(self.prior, energy.seed, _REFINEMENT, ids, step)
+            noise = keyed_noise(self.prior, ids.device, energy.seed, _REFINEMENT, keys, step)
             relative = (poses[:, target] - poses[:, source])[:, None]
             return self._one_way(energy, views[:, target], views[:, source], relative, noise)
 
@@ -247,10 +247,12 @@ class IDPose(Solver):
         return Refined(torch.where(count > 0, mean, selected), valid[:, 0], trajectory)
 
     def _moved(self, cycle: Sequence[tuple[int, int]], ids: Tensor, seed: int, others: int) -> Tensor:
-        """Which image a step moves, `[steps, S, V]`: of its pair the one that is not the first, of two others a random
-        one."""
-        number = torch.arange(others * self.refinement_steps, device=ids.device)[:, None]
-        source, target = torch.tensor(cycle, device=ids.device)[number % len(cycle)].unbind(-1)  # [steps, 1]
+        """Which image a step moves, `[steps, S, V]`, on the CPU.
+
+        Of the step's pair it is the image that is not the first, of two others a random one.
+        """
+        number = torch.arange(others * self.refinement_steps)[:, None]
+        source, target = torch.tensor(cycle)[number % len(cycle)].unbind(-1)  # [steps, 1]
         coin = keyed_uniform(seed, _REFINEMENT, ids, number, count=1)[..., 0] < 0.5
         of_two = torch.where(coin, source, target)
         moved = torch.where(torch.minimum(source, target) > 0, of_two, torch.maximum(source, target))

@@ -56,7 +56,7 @@ class Langevin(Solver):
         began = now(starts.device)
         codes = self.model.encode(pairs.images)
         condition = self.model.condition(codes[pairs.reference], codes[pairs.query])[:, None]  # [B, 1, ...]
-        noise = self._noise(pairs, starts.shape[1], seed).to(starts)
+        noise = self._noise(pairs, starts, seed)
         pose, trajectory = starts, [starts]
         for step in steps_of(self.iterations, "first stage"):
             pose = pose + self.alpha * self.model.field(condition, pose).score + noise[:, :, step]
@@ -72,14 +72,13 @@ class Langevin(Solver):
             trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
         )
 
-    def _noise(self, pairs: Pairs, starts: int, seed: int) -> Tensor:
+    def _noise(self, pairs: Pairs, starts: Tensor, seed: int) -> Tensor:
         """The noise gamma z_t of every start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""
+        count, shape = starts.shape[1], (*starts.shape[:2], self.iterations, 3)
         if not any(self.gamma):
-            return torch.zeros(len(pairs), starts, self.iterations, 3, device=pairs.ids.device)
-        number = torch.arange(starts, device=pairs.ids.device)
-        draws = keyed_normal(seed, pairs.ids[:, None], number, count=3 * self.iterations)
-        gamma = torch.tensor(self.gamma, dtype=draws.dtype, device=draws.device)
-        return draws.view(len(pairs), starts, self.iterations, 3) * gamma
+            return starts.new_zeros(shape)
+        draws = keyed_normal(seed, pairs.ids[:, None], torch.arange(count), count=3 * self.iterations)
+        return (draws.view(shape) * torch.tensor(self.gamma, dtype=draws.dtype)).to(starts)
 
     def _energies(self, condition: Tensor, ends: Tensor) -> Tensor:
         """By what the answer is chosen, `[B, N]`: see the class."""

@@ -139,5 +139,5 @@ class Learned(Matcher):
         places = []
         for key, image in zip(("keypoints0", "keypoints1"), images, strict=True):
             size = np.array(image.shape[1::-1])  # pixels of SIDE are counted from the centre of their first, too
-            places.append(found[key].double().cpu().numpy() / FINER + size / (2 * SIDE) - 0.5)
+            places.append(found[key].cpu().double().numpy() / FINER + size / (2 * SIDE) - 0.5)
         return Matches(*places).within(reference[1], query[1])

@@ -158,7 +158,7 @@ class MultiView(Solver):
 
     def fit(self, measured: Measured) -> Joint:
         """2. One answer a set; it is valid where every image has been measured with some other."""
-        poses = fit_views(measured.poses, measured.weights)[:, None, 1:].to(measured.poses.dtype)
+        poses = fit_views(measured.poses, measured.weights)[:, None, 1:].to(measured.poses)
         known = (measured.weights > 0).any(dim=-1)
         return Joint.at(poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True), measured.passes)
 

@@ -9,20 +9,20 @@ import torch
 from torch import Tensor
 
 from lp_framework.errors import UserError
-from lp_framework.keyed_random import keyed_normal
+from lp_framework.keyed_random import keyed_normal, on_cpu, to_device
 from lp_framework.priors.base import Prior, ViewCode
 from lp_framework.solvers.base import Pairs
 
 _NOISE = 0x4E4F  # separates the prior's noise from a solver's other draws under the same seed
 
 
-def keyed_noise(prior: Prior, *keys: Tensor | int) -> Tensor:
-    """Standard normal noise `[..., *latent_shape]` (float32) for integer keys that broadcast to `[...]`."""
-    device = next((key.device for key in keys if isinstance(key, Tensor)), None)
-    # Numbers are filled in on the device: to copy one there from the host waits for all that the device has to do.
-    filled = (key if isinstance(key, Tensor) else torch.full((), key, device=device) for key in (_NOISE, *keys))
-    draws = keyed_normal(*filled, count=math.prod(prior.latent_shape))
-    return draws.float().unflatten(-1, prior.latent_shape)
+def keyed_noise(prior: Prior, device: torch.device, *keys: Tensor | int) -> Tensor:
+    """Standard normal noise `[..., *latent_shape]` (float32) for integer keys that broadcast to `[...]`.
+
+    Keys on the CPU make it without waiting for what the device has to do.
+    """
+    draws = keyed_normal(_NOISE, *keys, count=math.prod(prior.latent_shape))
+    return to_device(draws.float().unflatten(-1, prior.latent_shape), device)
 
 
 class PairEnergy:
@@ -35,6 +35,7 @@ class PairEnergy:
 
     def __init__(self, prior: Prior, pairs: Pairs, seed: int, codes: ViewCode | None = None) -> None:
         self.prior, self.pairs, self.seed = prior, pairs, seed
+        self._ids = on_cpu(pairs.ids)[:, None, None]
         self.passes = 0
         if codes is None:
             # Of a clone, because tensors made in inference mode, and their views, cannot take part in autograd.
@@ -48,9 +49,8 @@ class PairEnergy:
 
         Keyed by seed, pair, step, number (of `count`) and direction: all starts of a pair meet the same.
         """
-        ids = self.pairs.ids[:, None, None]
-        number, direction = torch.arange(count, device=ids.device)[:, None], torch.arange(2, device=ids.device)
-        return keyed_noise(self.prior, self.seed, ids, step, number, direction)
+        number, direction = torch.arange(count)[:, None], torch.arange(2)
+        return keyed_noise(self.prior, self.pairs.ids.device, self.seed, self._ids, step, number, direction)
 
     def mean(self, poses: Tensor, timesteps: Sequence[int], noise: Tensor) -> Tensor:
         """Mean energies `[B, N]` of poses `[B, N, 3]` over timesteps, each with its noise `[B, count, 2, ...]`."""

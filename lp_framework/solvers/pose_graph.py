@@ -22,7 +22,9 @@ ROUNDS = 30
 
 @torch.no_grad()
 def fit_views(measured: Tensor, weights: Tensor) -> Tensor:
-    """Poses `[S, V, 3]` of V images relative to their first (which is 0), for S sets; longitudes in [0, 2 pi), float64.
+    """Poses `[S, V, 3]` of V images relative to their first (which is 0), for S sets; longitudes in [0, 2 pi).
+
+    They are computed, and come back, in float64 on the CPU.
 
     `measured[s, i, j, k]` is the k-th of K measurements of the pose of image j relative to i (longitude on any turn),
     `[S, V, V, K, 3]`; `weights` `[S, V, V, K]`, not negative, say how much each counts. Several measurements of a pair
@@ -30,8 +32,8 @@ def fit_views(measured: Tensor, weights: Tensor) -> Tensor:
     so does the diagonal. Two images have the mean of what is measured in both directions, as long as it agrees to
     about `SCALE`, else one of the two.
     """
-    views = measured.shape[1]
-    diagonal = torch.eye(views, dtype=torch.bool, device=measured.device)[..., None]
+    measured, weights = measured.cpu(), weights.cpu()
+    diagonal = torch.eye(measured.shape[1], dtype=torch.bool)[..., None]
     counted = measured.isfinite().all(dim=-1) & (weights > 0) & ~diagonal
     weights = torch.where(counted, weights, 0.0).double()
     measured = torch.where(counted[..., None], measured, 0.0).double()
@@ -43,7 +45,7 @@ def fit_views(measured: Tensor, weights: Tensor) -> Tensor:
         poses = _least_squares(poses, measured, weights * (1 + squared / scale**2).pow(-2))
         squared = _residual(poses, measured).square().sum(dim=-1)
     cost = (weights * squared / (squared + SCALE**2)).sum(dim=(-3, -2, -1))
-    best = poses[torch.arange(len(poses), device=poses.device), cost.argmin(dim=1)]
+    best = poses[torch.arange(len(poses)), cost.argmin(dim=1)]
     return relative_pose(best[:, :1], best)
 
 

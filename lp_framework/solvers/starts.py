@@ -75,7 +75,6 @@ class Random(Starts):
         self.count, self.latitude = count, latitude
 
     def make(self, pairs: Pairs, seed: int) -> Tensor:
-        number = torch.arange(self.count, device=pairs.ids.device)
-        uniform = keyed_uniform(seed, _STARTS, pairs.ids[:, None], number, count=2)
+        uniform = keyed_uniform(seed, _STARTS, pairs.ids[:, None], torch.arange(self.count), count=2)
         latitude, longitude = (2 * uniform[..., 0] - 1) * self.latitude, uniform[..., 1] * 2 * math.pi
-        return torch.stack([latitude, longitude, torch.zeros_like(latitude)], dim=-1).float()
+        return torch.stack([latitude, longitude, torch.zeros_like(latitude)], dim=-1).float().to(pairs.ids.device)

@@ -59,8 +59,11 @@ class PrincipalLatents(nn.Module):
 
     @torch.no_grad()
     def fit(self, pixels: Tensor) -> None:
-        """Take the basis from pixels `[I, 3 * 64 * 64]`; with fewer images than `dim` the rest of it is zero."""
-        small = _halve(pixels.float()).double()
+        """Take the basis from pixels `[I, 3 * 64 * 64]`; with fewer images than `dim` the rest of it is zero.
+
+        It is computed in float64, so on the CPU.
+        """
+        small = _halve(pixels.float()).cpu().double()
         mean = small.mean(dim=0)
         variances, vectors = principal_components((small - mean) / len(small) ** 0.5)
         missing = max(0, self.dim - len(variances))

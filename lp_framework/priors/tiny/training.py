@@ -124,7 +124,7 @@ class PriorModel(TrainedModule):
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
         latents, ids = self.networks.latents(self._pixels(batch)), batch.ids
-        timestep = keyed_bits(self.seed, ids, count=1).squeeze(-1) % len(self.alphas_cumprod)
+        timestep = keyed_bits(self.seed, ids, count=1).squeeze(-1).to(self.device) % len(self.alphas_cumprod)
         noise = keyed_normal(self.seed, ids, count=latents.shape[1]).to(latents)
         error, _ = self._denoise(batch, self.networks.encoder(self._features(batch)), latents, timestep, noise)
         self.validation_loss.update(ids, error)
