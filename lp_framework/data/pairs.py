@@ -25,10 +25,10 @@ class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
     `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, ...]` that a frozen backbone computed from them; `names` of the
-    views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]` (float64, the truth, always on the CPU);
-    `objects` `[I]`; `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view table. Where
-    they are asked for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]` (float32) along the optical axis in scene
-    units, 0 where there is nothing.
+    views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]`, the truth (float64, always on the
+    CPU); `objects` `[I]`; `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view
+    table. Where they are asked for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]` (float32) along the optical
+    axis in scene units, 0 where there is nothing.
     """
 
     pixels: Tensor | None
