@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # The main job from nothing: install, render the embedded objects, train a score model, evaluate it with and without
 # the second stage.
-# What is there already is taken as it is; arguments go to the training, e.g. `model=energy`.
+# Existing outputs are reused; arguments go to the training, e.g. `model=energy`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-bash scripts/setup.sh
+bash scripts/setup.sh ""  # without what only the tests need
 python=.venv/bin/python
 run="runs/quickstart"
 if [ -f "$run/training.json" ] && [ $# -eq 0 ]; then
@@ -19,7 +19,7 @@ else
 fi
 echo
 echo "quickstart: the first stage alone, without noise (gamma 0)"
-$python -m lp_framework eval "checkpoint=$run" solver.gamma=0 "hydra.run.dir=$run/eval_first_stage"
+$python -m lp_framework eval "checkpoint=$run" solver.gamma=0 pictures=false "hydra.run.dir=$run/eval_first_stage"
 echo
 echo "quickstart: both stages, the second one on the prior that ships"
 $python -m lp_framework eval "checkpoint=$run" solver=two_stage solver.gamma=0 "hydra.run.dir=$run/eval_two_stage"
