@@ -1,11 +1,11 @@
-"""Rotations and rigid motions: SO(3) and SE(3) with exponential and logarithm.
+"""Rotations and rigid motions: SO(3) and SE(3) with their exponentials.
 
 Convention: matrices act on column vectors; angles in radians; a twist `xi` `[..., 6]` holds the translation part
 first, then the rotation part (iFusion's order). `se3_exp(xi)` is the matrix exponential of
 `[[hat(xi[3:]), xi[:3]], [0, 0]]`, so the translation of the result is `V(omega) rho`, not `rho`.
-Batch dimensions are any and broadcast where there are two arguments. Exponentials and logarithms have correct first and
-second derivatives, in reverse and forward mode, at and near zero too. Products are written out elementwise: a matrix
-product would lose digits under autocast or TF32.
+Batch dimensions are any and broadcast where there are two arguments. Exponentials have correct first and second
+derivatives, in reverse and forward mode, at and near zero too. Products are written out elementwise: a matrix product
+would lose digits under autocast or TF32.
 """
 
 from __future__ import annotations
@@ -16,27 +16,21 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-_TERMS = 12  # below the thresholds used here, enough for float64 in the value and both derivatives
-_BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330)
-
-# Power series in the squared angle.
+# Power series in the squared angle; below 1, 12 terms are enough for float64 in the value and both derivatives.
+_TERMS = 12
 _SIN_SERIES = [(-1) ** k / math.factorial(2 * k + 1) for k in range(_TERMS)]  # sin(t) / t
 _COS_SERIES = [(-1) ** k / math.factorial(2 * k + 2) for k in range(_TERMS)]  # (1 - cos t) / t^2
 _CUBIC_SERIES = [(-1) ** k / math.factorial(2 * k + 3) for k in range(_TERMS)]  # (t - sin t) / t^3
-_COTANGENT_SERIES = [b / math.factorial(2 * k + 2) for k, b in enumerate(_BERNOULLI)]  # (1 - t/2 cot(t/2)) / t^2
-_ATAN_SERIES = [(-1) ** k / (2 * k + 1) for k in range(_TERMS + 4)]  # atan(t) / t
 
 
-def _even_function(
-    squared: Tensor, closed_form: Callable[[Tensor], Tensor], series: Sequence[float], series_below: float = 1.0
-) -> Tensor:
-    """An even function of t, given t^2: its power series where t^2 < `series_below`, else `closed_form(t)`.
+def _even_function(squared: Tensor, closed_form: Callable[[Tensor], Tensor], series: Sequence[float]) -> Tensor:
+    """An even function of t, given t^2: its power series where t^2 < 1, else `closed_form(t)`.
 
     Each branch sees harmless arguments where the other is taken, so that no NaN of the untaken one reaches a gradient.
     `squared` needs a dimension: under vmap, forward-mode tangents of 0-dimensional float32 tensors that meet a Python
     float come out in float64 (seen with PyTorch 2.13).
     """
-    near = squared < series_below
+    near = squared < 1
     inside = squared.masked_fill(~near, 0.0)
     total = torch.full_like(squared, series[-1])
     for coefficient in reversed(series[:-1]):
@@ -54,16 +48,6 @@ def _cos_ratio(squared: Tensor) -> Tensor:
 
 def _cubic_ratio(squared: Tensor) -> Tensor:
     return _even_function(squared, lambda t: (t - t.sin()) / t**3, _CUBIC_SERIES)
-
-
-def _cotangent_ratio(squared: Tensor) -> Tensor:
-    return _even_function(
-        squared, lambda t: (1 - t / 2 * (t / 2).cos() / (t / 2).sin()) / t.square(), _COTANGENT_SERIES
-    )
-
-
-def _atan_ratio(squared: Tensor) -> Tensor:
-    return _even_function(squared, lambda t: t.atan() / t, _ATAN_SERIES, series_below=1 / 16)
 
 
 def hat(omega: Tensor) -> Tensor:
@@ -93,40 +77,6 @@ def so3_exp(omega: Tensor) -> Tensor:
     # hat(omega)^2 = omega omega^T - |omega|^2 I
     outer = omega[..., :, None] * omega[..., None, :]
     return first * hat(omega) + second * outer + (1 - second * squared) * identity
-
-
-def so3_log(rotation: Tensor) -> Tensor:
-    """Rotation vector `[..., 3]` (axis times angle, radians, angle in [0, pi]) of a rotation `[..., 3, 3]`.
-
-    By way of the unit quaternion, hence accurate up to an angle of pi, where the axis has either sign.
-
-    >>> so3_log(so3_exp(torch.tensor([0.1, -0.2, 3.0])))
-    tensor([ 0.1000, -0.2000,  3.0000])
-    """
-    quaternion = _quaternion(rotation)
-    real, imaginary = quaternion[..., :1], quaternion[..., 1:]
-    # tan(angle / 4) = |imaginary| / (1 + real) is at most 1 and has no singular point for angles up to pi.
-    quarter = imaginary / (1 + real)
-    return 4 * _atan_ratio(quarter.square().sum(-1, keepdim=True)) * quarter
-
-
-def _quaternion(rotation: Tensor) -> Tensor:
-    """Unit quaternion (w, x, y, z) `[..., 4]` with w >= 0 of a rotation `[..., 3, 3]` (Shepperd 1978)."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation.flatten(-2).unbind(-1)
-    # The rows of 4 q q^T: each is q times four of its components; the largest component divides without cancellation.
-    products = torch.stack(
-        [
-            *(1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
-            *(zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx),
-            *(xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy),
-            *(yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz),
-        ],
-        dim=-1,
-    ).unflatten(-1, (4, 4))
-    largest = products.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    row = torch.take_along_dim(products, largest, dim=-2).squeeze(-2)
-    row = torch.where(row[..., :1] < 0, -row, row)
-    return row / row.square().sum(-1, keepdim=True).sqrt()
 
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
@@ -193,19 +143,3 @@ def se3_exp(xi: Tensor) -> Tensor:
     turned = torch.linalg.cross(omega, rho, dim=-1)
     translation = rho + second * turned + third * torch.linalg.cross(omega, turned, dim=-1)
     return rigid_transform(so3_exp(omega), translation)
-
-
-def se3_log(transform: Tensor) -> Tensor:
-    """Twist `[..., 6]` (translation part in scene units, then radians) of a rigid transform `[..., 4, 4]`.
-
-    The inverse of `se3_exp` for rotation angles below pi.
-
-    >>> se3_log(se3_exp(torch.tensor([1.0, -0.5, 0.2, 0.3, 0.1, 2.0])))
-    tensor([ 1.0000, -0.5000,  0.2000,  0.3000,  0.1000,  2.0000])
-    """
-    omega, translation = so3_log(transform[..., :3, :3]), transform[..., :3, 3]
-    squared = omega.square().sum(-1, keepdim=True)
-    # V^-1 t with V^-1 = I - hat(omega) / 2 + ratio * hat(omega)^2
-    turned = torch.linalg.cross(omega, translation, dim=-1)
-    rho = translation - turned / 2 + _cotangent_ratio(squared) * torch.linalg.cross(omega, turned, dim=-1)
-    return torch.cat([rho, omega], dim=-1)

@@ -1,4 +1,4 @@
-"""Spherical view poses, relative poses, and the cameras that they stand for.
+"""Spherical view poses, relative poses, the cameras that they stand for, and errors between cameras.
 
 Convention (the paper's appendix, Coordinate System): a view pose `[..., 3]` is (latitude, longitude, radius) in
 radians, radians, scene units. Latitude is up-positive from the equator; longitude 0 lies on +Z and grows towards +X
@@ -97,6 +97,27 @@ def view_pose(camera: Tensor) -> Tensor:
     return reduce_longitude(torch.cat([torch.atan2(y, horizontal), longitude, radius], dim=-1))
 
 
+def rotation_error(predicted: Tensor, true: Tensor) -> Tensor:
+    """Geodesic angle `[...]` in degrees, in [0, 180], between the rotations of two cameras (paper, Evaluation Metrics).
+
+    Each is a camera-to-world matrix `[..., 4, 4]` or a rotation `[..., 3, 3]`; batch dimensions broadcast.
+
+    >>> rotation_error(camera_to_world(torch.tensor([0.0, 0.3, 1.5])), camera_to_world(torch.tensor([0.0, 0.1, 2.0])))
+    tensor(11.4592)
+    """
+    return torch.rad2deg(geodesic_angle(predicted[..., :3, :3], true[..., :3, :3]))
+
+
+def translation_error(predicted: Tensor, true: Tensor) -> Tensor:
+    """Distance `[...]` in scene units between the centres of two cameras `[..., 4, 4]`.
+
+    >>> near, far = camera_to_world(torch.tensor([[0.0, 0.4, 1.5], [0.0, 0.4, 2.0]]))
+    >>> translation_error(near, far)
+    tensor(0.5000)
+    """
+    return torch.linalg.vector_norm(predicted[..., :3, 3] - true[..., :3, 3], dim=-1)
+
+
 def spherical_residual(camera: Tensor) -> Tensor:
     """How far a camera `[..., 4, 4]` is from spherical: angle `[...]` in degrees to the spherical one at its centre.
 
@@ -106,18 +127,7 @@ def spherical_residual(camera: Tensor) -> Tensor:
     >>> spherical_residual(upright)
     tensor(45.)
     """
-    spherical = camera_to_world(view_pose(camera))
-    return torch.rad2deg(geodesic_angle(camera[..., :3, :3], spherical[..., :3, :3]))
-
-
-def from_ifusion(latlon_degrees: Tensor) -> Tensor:
-    """View pose `[..., 3]` of an iFusion `latlon` `[..., 3]`: (down-positive latitude, longitude, in degrees; radius).
-
-    >>> from_ifusion(torch.tensor([-30.0, 90.0, 1.5]))
-    tensor([0.5236, 1.5708, 1.5000])
-    """
-    down, longitude, radius = latlon_degrees.split(1, dim=-1)
-    return reduce_longitude(torch.cat([-torch.deg2rad(down), torch.deg2rad(longitude), radius], dim=-1))
+    return rotation_error(camera, camera_to_world(view_pose(camera)))
 
 
 def to_ifusion(pose: Tensor) -> Tensor:
