@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from lp_framework.geometry import camera_to_world, from_opencv, inverse
 from lp_framework.solvers.base import Solver
-from lp_framework.solvers.matchers import Matches
+from lp_framework.solvers.features import Matches
 
 FIELD_OF_VIEW = 49.1  # degrees
 BALL = np.random.default_rng(0).normal(size=(80, 3)) / 8  # places on an object

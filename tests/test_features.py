@@ -30,8 +30,7 @@ from lp_framework.geometry import (
     wrap_angle,
 )
 from lp_framework.solvers.base import Pairs, Solution, ViewSets
-from lp_framework.solvers.features import Features
-from lp_framework.solvers.matchers import Learned, Matches, Sift, foreground
+from lp_framework.solvers.features import Features, Learned, Matches, Sift, foreground
 
 SIZE = 256
 FOCAL = SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)

@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from scipy.ndimage import binary_fill_holes
+from torch import Tensor, nn
 
 from lp_framework.errors import UserError, check_settings, optional_import
 from lp_framework.geometry import from_opencv, inverse
 from lp_framework.keyed_random import keyed_bits
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.matchers import Learned, Matcher, Matches, Sift
-from lp_framework.solvers.relative_cameras import RelativeCameraSolver
+from lp_framework.solvers.relative_cameras import RelativeCameraSolver, with_weights
 
+INSTALL = "pip install 'lp_framework[features]'"
 MINIMAL = 5  # matches that fix an essential matrix
+WEIGHTS = {  # hub ids of the learned matchers' published weights
+    "lightglue": "ETH-CVG/lightglue_superpoint",
+    "efficientloftr": "zju-community/efficientloftr",
+}
+SIDE = 640  # pixels of the images that learned matchers see; a multiple of 32, which EfficientLoFTR needs
+FINER = 64  # the processors round to whole pixels of the size that they are told; so to 1/64 of an image's
+WHITE = 0.98  # of [-1, 1]: what is darker in some channel is the object's
 
 
 @register("solver", "features")
 class Features(RelativeCameraSolver):
     """Matched local features and their essential matrix; one answer a pair, or none.
 
-    Matches come from SIFT, with the ratio test at `ratio` and mutual, or from a learned matcher with `weights` of its
-    own (a folder or a hub id; by default the published ones, downloaded). The essential matrix is that of PoseLib's
-    LO-RANSAC, refined on its inliers, those within `tolerance_pixels` of their epipolar lines, for square images with a
-    field of view of `field_of_view_degrees`. With fewer than `fewest_inliers` of them there is no answer. Matches that
-    have mostly not moved by more than `tolerance_pixels` say that both images are from the same place, where an
-    essential matrix says nothing.
+    The essential matrix is that of PoseLib's LO-RANSAC, refined on its inliers, for square images. With fewer than
+    `fewest_inliers` of them there is no answer. Matches that have mostly not moved by more than `tolerance_pixels` say
+    that both images are from the same place, where an essential matrix says nothing.
 
     The energy of an answer is the share of matches that do not fit it. RANSAC draws by seed and pair. See
-    `RelativeCameraSolver` for `reference_radius` and the cameras; starts are ignored.
+    `RelativeCameraSolver` for `reference_radius` and the cameras.
     """
 
     def __init__(
@@ -56,8 +61,8 @@ class Features(RelativeCameraSolver):
         )
         if matcher == "sift" and weights is not None:
             raise UserError(f"solver.matcher=sift has no weights, got solver.weights={weights}")
-        self.poselib = optional_import("poselib", "solver=features", "pip install 'lp_framework[features]'")
-        self.matcher: Matcher = Sift(ratio) if matcher == "sift" else Learned(matcher, weights)
+        self.poselib = optional_import("poselib", "solver=features", INSTALL)
+        self.matcher = Sift(ratio) if matcher == "sift" else Learned(matcher, weights)
         self.network = self.matcher.network  # where those look who move it to a device
         self.tolerance, self.fewest_inliers = tolerance_pixels, fewest_inliers
         self.field_of_view = math.radians(field_of_view_degrees)
@@ -102,3 +107,99 @@ class Features(RelativeCameraSolver):
         to_query = np.eye(4)
         to_query[:3, :3], to_query[:3, 3] = pose.R, pose.t / np.linalg.norm(pose.t)
         return inverse(torch.from_numpy(to_query)).numpy(), 1 - report["num_inliers"] / count
+
+
+# ---------------------------------------------------------------- matchers: every image is described once
+
+
+class Matches(NamedTuple):
+    """M points in the reference and the query image that show the same place, `[M, 2]` each: x to the right and y down
+    in pixels, (0, 0) the centre of the first one."""
+
+    reference: NDArray[np.float64]
+    query: NDArray[np.float64]
+
+
+class Sift:
+    """SIFT of OpenCV (Lowe 2004) within the object, matched where nearest both ways and clearly nearer than the next.
+
+    `ratio` is the largest share that the distance of the nearest descriptor may be of the second nearest's.
+    """
+
+    network = None
+
+    def __init__(self, ratio: float) -> None:
+        self.cv2, self.ratio = optional_import("cv2", "solver=features", INSTALL), ratio
+        self.sift = self.cv2.SIFT_create(enable_precise_upscale=True)  # else points are off by a quarter of a pixel
+        self.nearest = self.cv2.BFMatcher(self.cv2.NORM_L2)
+
+    def describe(self, image: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Points `[K, 2]` and descriptors `[K, 128]` of an image `[3, H, W]` in [-1, 1] on white."""
+        grey = self.cv2.cvtColor(pixels(image), self.cv2.COLOR_RGB2GRAY)
+        points, descriptors = self.sift.detectAndCompute(grey, foreground(image).astype(np.uint8))
+        places = np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2)
+        return places, np.zeros((0, 128), np.float32) if descriptors is None else descriptors
+
+    def match(self, reference: Any, query: Any) -> Matches:
+        """Matches of two described images."""
+        forth, back = self._pairs(reference[1], query[1]), self._pairs(query[1], reference[1])
+        mutual = [(first, second) for first, second in forth.items() if back.get(second) == first]
+        first, second = np.array(mutual, dtype=int).reshape(-1, 2).T
+        return Matches(reference[0][first], query[0][second])
+
+    def _pairs(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> dict[int, int]:
+        """For those of our descriptors that pass the ratio test, the nearest of theirs."""
+        if len(theirs) < 2:
+            return {}
+        two = self.nearest.knnMatch(ours, theirs, k=2)
+        return {near.queryIdx: near.trainIdx for near, far in two if near.distance < self.ratio * far.distance}
+
+
+class Learned:
+    """A network of transformers that matches key points: LightGlue on SuperPoint (2023) or EfficientLoFTR (2024)."""
+
+    network: nn.Module
+
+    def __init__(self, name: str, weights: str | None) -> None:
+        library = optional_import("transformers", f"solver.matcher={name}", "pip install 'transformers>=4.54'")
+
+        def load(source: str) -> tuple[Any, nn.Module]:
+            network = library.AutoModelForKeypointMatching.from_pretrained(source)
+            return library.AutoImageProcessor.from_pretrained(source), network
+
+        self.processor, self.network = with_weights(load, name, weights or WEIGHTS[name])
+        self.network.eval().requires_grad_(False)
+
+    def describe(self, image: Tensor) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Pixels `[H, W, 3]` and where the object is, `[H, W]`, of an image `[3, H, W]` in [-1, 1] on white."""
+        return pixels(image), foreground(image)
+
+    @torch.no_grad()
+    def match(self, reference: Any, query: Any) -> Matches:
+        """Matches on the objects of two described images."""
+        images = [reference[0], query[0]]
+        inputs = self.processor([images], size={"height": SIDE, "width": SIDE}, return_tensors="pt")
+        outputs = self.network(**inputs.to(next(self.network.parameters()).device))
+        sizes = [[tuple(FINER * side for side in image.shape[:2]) for image in images]]
+        # Its threshold of scores is the least that EfficientLoFTR's own settings keep.
+        (found,) = self.processor.post_process_keypoint_matching(outputs, sizes, threshold=0.2)
+        ends, on_object = [], np.ones(len(found["keypoints0"]), dtype=bool)
+        for key, (image, mask) in (("keypoints0", reference), ("keypoints1", query)):
+            size = np.array(image.shape[1::-1])  # pixels of SIDE are counted from the centre of their first, too
+            points = found[key].cpu().double().numpy() / FINER + size / (2 * SIDE) - 0.5
+            column, row = np.rint(points).astype(int).clip(0, size - 1).T
+            on_object &= mask[row, column]
+            ends.append(points)
+        return Matches(ends[0][on_object], ends[1][on_object])
+
+
+def foreground(image: Tensor) -> NDArray[np.bool_]:
+    """Where the object is, `[H, W]`, in an image `[3, H, W]` on white: what is not white, and white within it."""
+    filled: NDArray[np.bool_] = binary_fill_holes((image.amin(dim=0) < WHITE).cpu().numpy())
+    return filled
+
+
+def pixels(image: Tensor) -> NDArray[np.uint8]:
+    """Pixels `[H, W, 3]` of an image `[3, H, W]` in [-1, 1]."""
+    levels = ((image.float() + 1) * 127.5).round().clamp(0, 255).byte()
+    return np.ascontiguousarray(levels.permute(1, 2, 0).cpu().numpy())

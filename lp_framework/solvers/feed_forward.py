@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 from abc import abstractmethod
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +16,16 @@ from lp_framework.errors import UserError, optional_import
 from lp_framework.geometry import from_opencv, inverse, relative_camera, rigid_transform
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.matchers import weights_error
-from lp_framework.solvers.relative_cameras import RelativeCameraSolver
+from lp_framework.solvers.relative_cameras import RelativeCameraSolver, with_weights
 
 
 class FeedForward(RelativeCameraSolver):
     """A network that sees a pair, the reference first, and predicts both cameras, in any frame and at any scale.
 
-    The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`.
+    The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`. See
+    `RelativeCameraSolver` for `reference_radius` and the cameras.
     """
 
-    network: nn.Module
     patch: int
     passes_per_pair: int
 
@@ -60,10 +57,8 @@ class FeedForward(RelativeCameraSolver):
 class Dust3r(FeedForward):
     """DUSt3R (Wang et al. 2024): point maps of both images, and the cameras that fit them; one answer a pair.
 
-    Needs the authors' package on Python's path (docs/baselines.md). `weights` are a checkpoint file, a folder or a hub
-    id. Images are the authors' own preparation with `square_ok`: whole. The cameras are those of their `PairViewer`:
-    both orders of the images go through the network, and the more confident one's points fix the other camera. See
-    `RelativeCameraSolver` for `reference_radius` and the cameras; starts are ignored.
+    Images are the authors' own preparation with `square_ok`: whole. The cameras are those of their `PairViewer`: both
+    orders of the images go through the network, and the more confident one's points fix the other camera.
     """
 
     patch, passes_per_pair = 16, 2
@@ -79,7 +74,7 @@ class Dust3r(FeedForward):
             optional_import(f"dust3r.{part}", "solver=dust3r", where) for part in ("model", "inference", "cloud_opt")
         )
         torch.serialization.add_safe_globals([argparse.Namespace])  # in its checkpoint files, beside the weights
-        network = _loaded(model.AsymmetricCroCo3DStereo.from_pretrained, "DUSt3R", weights)
+        network = with_weights(model.AsymmetricCroCo3DStereo.from_pretrained, "DUSt3R", weights)
         super().__init__(network, image_size, reference_radius)
 
     def cameras(self, images: Tensor) -> Tensor:
@@ -97,19 +92,26 @@ class Dust3r(FeedForward):
 
 @register("solver", "vggt")
 class VGGT(FeedForward):
-    """VGGT (Wang et al. 2025): both cameras from its camera head; one answer a pair.
-
-    Needs the authors' package (docs/baselines.md). `weights` are a checkpoint file, a folder or a hub id. See
-    `RelativeCameraSolver` for `reference_radius` and the cameras; starts are ignored.
-    """
+    """VGGT (Wang et al. 2025): both cameras from its camera head; one answer a pair."""
 
     patch, passes_per_pair = 14, 1
 
     def __init__(self, weights: str = "facebook/VGGT-1B", image_size: int = 518, reference_radius: float = 1.4) -> None:
         package = "pip install git+https://github.com/facebookresearch/vggt"
-        model = optional_import("vggt.models.vggt", "solver=vggt", package)
+        model = optional_import("vggt.models.vggt", "solver=vggt", package).VGGT
         self.encoding = optional_import("vggt.utils.pose_enc", "solver=vggt", package)
-        super().__init__(_loaded(partial(_load_vggt, model.VGGT), "VGGT", weights), image_size, reference_radius)
+
+        def load(source: str) -> nn.Module:
+            if not Path(source).is_file():
+                downloaded: nn.Module = model.from_pretrained(source)
+                return downloaded
+            safe = source.endswith(".safetensors")
+            values = load_file(source) if safe else torch.load(source, map_location="cpu", weights_only=True)
+            network: nn.Module = model()
+            network.load_state_dict(values)
+            return network
+
+        super().__init__(with_weights(load, "VGGT", weights), image_size, reference_radius)
 
     def cameras(self, images: Tensor) -> Tensor:
         network: Any = self.network
@@ -120,24 +122,3 @@ class VGGT(FeedForward):
         world_to_camera, _ = self.encoding.pose_encoding_to_extri_intri(encoded, batch.shape[-2:])
         matrices = world_to_camera[0].cpu().double()  # [2, 3, 4]
         return inverse(rigid_transform(matrices[..., :3], matrices[..., 3]))
-
-
-def _loaded(load: Callable[[str], nn.Module], name: str, weights: str) -> nn.Module:
-    """What `load` makes of weights; `UserError` where it cannot."""
-    if Path(weights).suffix in (".pt", ".pth", ".safetensors") and not Path(weights).is_file():
-        raise UserError(f"{weights}: there is no such file with the weights of {name}")
-    try:
-        return load(weights)
-    except Exception as error:  # the hub's package and its HTTP libraries have many of their own
-        raise weights_error(name, weights, error) from error
-
-
-def _load_vggt(network: Any, weights: str) -> nn.Module:
-    """VGGT with the weights of a file, or by its own means, which do not read files."""
-    if not Path(weights).is_file():
-        loaded: nn.Module = network.from_pretrained(weights)
-        return loaded
-    loaded = network()
-    safe = weights.endswith(".safetensors")
-    loaded.load_state_dict(load_file(weights) if safe else torch.load(weights, map_location="cpu", weights_only=True))
-    return loaded

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from lp_framework.clock import now
-from lp_framework.errors import check_settings
+from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import pose_of_relative_camera
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts
+
+Loaded = TypeVar("Loaded")
 
 
 class RelativeCameraSolver(Solver):
@@ -46,3 +51,17 @@ class RelativeCameraSolver(Solver):
             cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
             cameras=cameras.to(starts)[:, None],
         )
+
+
+def with_weights(load: Callable[[str], Loaded], network: str, weights: str) -> Loaded:
+    """What `load` makes of the weights of a network (a file, a folder or a hub id); `UserError` where it cannot."""
+    if Path(weights).suffix in (".pt", ".pth", ".safetensors") and not Path(weights).is_file():
+        raise UserError(f"{weights}: there is no such file with the weights of {network}")
+    try:
+        return load(weights)
+    except Exception as error:  # the hub's package and its HTTP libraries have many of their own
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(
+            f"{weights}: the weights of {network} cannot be had from there ({reason}); "
+            "give solver.weights= a local path or an id of the Hugging Face hub"
+        ) from error
