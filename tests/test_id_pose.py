@@ -260,16 +260,18 @@ def test_of_two_unknown_images_either_is_held_at_random():
 def test_answers_are_the_means_of_what_the_published_loop_records(averaged):
     sets, true = exact_sets(3, 3)
     solver = IDPose(ExactPrior(noisy=0.5, **SOFT), refinement_steps=20, averaged=averaged)
-    refined = solver.refine(PairEnergy(solver.prior, sets.with_first(), 0), sets.views, sets.ids, true + 0.1)
+    answers, _, trajectory = solver.refine(
+        PairEnergy(solver.prior, sets.with_first(), 0), sets.views, sets.ids, true + 0.1
+    )
     moved = solver._moved([(0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1)], sets.ids, seed=0, others=2)
     for s in range(3):
         recorded, selected = {1: [], 2: []}, None
         for step in range(len(moved)):  # as `find_optimal_poses` goes: record, select, update
             if selected is not None:
-                recorded[selected].append(refined.trajectory[s, step, selected - 1])
+                recorded[selected].append(trajectory[s, step, selected - 1])
             selected = int(moved[step, s].int().argmax())
         for image, poses in recorded.items():
-            torch.testing.assert_close(refined.poses[s, image - 1], torch.stack(poses[-averaged:]).mean(dim=0))
+            torch.testing.assert_close(answers[s, image - 1], torch.stack(poses[-averaged:]).mean(dim=0))
 
 
 def test_sets_do_not_depend_on_their_batch():

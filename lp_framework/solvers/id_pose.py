@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -31,41 +31,20 @@ from lp_framework.solvers.pair_energy import PairEnergy, keyed_noise
 _REFINEMENT = 0x4944  # separates the draws of the refinement from those of the exploration under the same seed
 
 
-class Candidates(NamedTuple):
-    """The K best of B pairs, best first: `poses` `[B, K, 3]`, their probed `energies` `[B, K]` (NaN where the prior
-    failed), the `trajectory` `[B, K, steps, 3]` on which they came there."""
-
-    poses: Tensor
-    energies: Tensor
-    trajectory: Tensor
-
-
-class Refined(NamedTuple):
-    """The answers `[S, V - 1, 3]` of S sets, `valid` `[S]`, and the `trajectory` `[S, steps + 1, V - 1, 3]`."""
-
-    poses: Tensor
-    valid: Tensor
-    trajectory: Tensor
-
-
 @register("solver", "id_pose")
 class IDPose(Solver):
     """ID-Pose: probes a grid of candidates, then plain gradient descent on the spherical pose, one direction a step.
 
-    Defaults are the published settings. Candidates are `longitudes` evenly around times `latitudes_degrees` (relative;
-    fewer where the elevations of the images are known), or with `candidates=starts` the given starts; otherwise
-    **starts are ignored**. All are probed in both directions with `probes` fixed noises at timesteps from `timestep`
-    to `timestep + timestep_span` (shares of the prior's range). The better half descends by `exploration_steps`, is
-    probed again, and the `kept` best stay. Among more than two images a candidate is judged by how well it goes with
-    the others' (triangular selection). The chosen ones descend by `refinement_steps` for each unknown image, with
-    fresh noise, at `timestep`; the answer is the mean of an image's last `averaged` poses, without the last step's.
+    Defaults are the published settings. Unless `candidates=starts`, **starts are ignored**. All candidates are probed
+    in both directions with `probes` fixed noises; the better half descends by `exploration_steps`, is probed again, and
+    the `kept` best stay. The chosen ones descend by `refinement_steps` for each unknown image, with fresh noise, at
+    `timestep` (a share of the prior's range); the answer is the mean of an image's last `averaged` poses.
 
     A `Solution` has the kept candidates as its N: the chosen one refined, the others as explored; the energies are
     those of the candidates before refinement, by which it was chosen.
 
-    The published code reads the raw weights of a checkpoint: `prior.weights=raw`. Its rates are for Zero123's energy.
-    Plain gradient descent diverges where rate times curvature passes 2: `prior=tiny`, whose valleys are steeper, wants
-    `exploration_rate=0.3 refinement_rate=0.03`.
+    The published code reads the raw weights of a checkpoint (`prior.weights=raw`), and its rates are for Zero123's
+    energy: plain gradient descent diverges where rate times curvature passes 2.
     """
 
     def __init__(
@@ -118,22 +97,21 @@ class IDPose(Solver):
         check_starts(pairs, starts)
         began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
-        found = self.explore(energy, starts)
-        chosen = choose(found.energies)
-        row = torch.arange(len(pairs), device=chosen.device)
+        explored, energies = self.explore(energy, starts)
+        chosen, row = choose(energies), torch.arange(len(pairs), device=starts.device)
+        ends, valid = explored[:, :, -1].clone(), energies.isfinite()
         views = torch.stack([pairs.reference, pairs.query], dim=1)
-        refined = self.refine(energy, views, pairs.ids, found.poses[row, chosen][:, None])
-        ends, valid = found.poses.clone(), found.energies.isfinite()
-        ends[row, chosen] = refined.poses[:, 0]
-        valid[row, chosen] &= refined.valid
+        refined, sound, steps = self.refine(energy, views, pairs.ids, ends[row, chosen][:, None])
+        ends[row, chosen] = refined[:, 0]
+        valid[row, chosen] &= sound
         trajectory = None
         if self.trajectory:
-            rest = found.trajectory[:, :, -1:].repeat(1, 1, refined.trajectory.shape[1] - 1, 1)
-            rest[row, chosen] = refined.trajectory[:, 1:, 0]
-            trajectory = torch.cat([found.trajectory, rest], dim=2)
+            rest = explored[:, :, -1:].repeat(1, 1, steps.shape[1] - 1, 1)
+            rest[row, chosen] = steps[:, 1:, 0]
+            trajectory = torch.cat([explored, rest], dim=2)
         return Solution(
             poses=reduce_longitude(ends),
-            energies=found.energies,
+            energies=energies,
             valid=valid,
             chosen=chosen,
             cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
@@ -151,30 +129,35 @@ class IDPose(Solver):
         began = now(starts.device)
         sets, views = view_sets.views.shape
         energy = PairEnergy(self.prior, view_sets.with_first(), seed)
-        found = self.explore(energy, starts.flatten(0, 1))
-        poses, alone = (each.unflatten(0, (sets, views - 1)) for each in found[:2])  # [S, V - 1, K, 3], [S, V - 1, K]
+        explored, alone = self.explore(energy, starts.flatten(0, 1))
+        poses, alone = (each.unflatten(0, (sets, views - 1)) for each in (explored[:, :, -1], alone))
         duos = list(combinations(range(views - 1), 2))
         between = self.energies_between(energy, view_sets, poses, duos)
         chosen = triangular_choice(alone, between, duos)
         selected = torch.take_along_dim(poses, chosen[..., None, None], dim=2).squeeze(2)
-        refined = self.refine(energy, view_sets.views, view_sets.ids, selected)
+        refined, valid, _ = self.refine(energy, view_sets.views, view_sets.ids, selected)
         energies = alone.new_full((sets, views, views), torch.nan)
         energies[:, 0, 1:] = alone.gather(2, chosen[..., None]).squeeze(-1)
         row = torch.arange(sets, device=chosen.device)
         for number, (i, j) in enumerate(duos):
             energies[:, i + 1, j + 1] = between[row, number, chosen[:, i], chosen[:, j]]
         return ViewSolution(
-            poses=reduce_longitude(refined.poses),
+            poses=reduce_longitude(refined),
             energies=torch.where(energies.isnan(), energies.mT, energies),  # both directions are in each
-            valid=refined.valid & energies[:, 0, 1:].isfinite().all(dim=1),
+            valid=valid & energies[:, 0, 1:].isfinite().all(dim=1),
             cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
         )
 
     # ------------------------------------------------------------ 1. exploration
 
-    def explore(self, energy: PairEnergy, starts: Tensor) -> Candidates:
-        """The best candidates of every pair: probed, the better half led a little downhill, probed again."""
-        poses = self.grid(starts) if self.candidates == "grid" else starts.clone()
+    def explore(self, energy: PairEnergy, starts: Tensor) -> tuple[Tensor, Tensor]:
+        """The trajectories `[B, K, steps, 3]` of the K best candidates, best first, and their probed energies `[B, K]`
+        (NaN where the prior failed): the better half of all is led a little downhill and probed again."""
+        poses = starts.clone()
+        if self.candidates == "grid":
+            longitudes = [2 * math.pi * number / self.longitudes for number in range(self.longitudes)]
+            grid = [(latitude, longitude, 0.0) for longitude in longitudes for latitude in self.latitudes]
+            poses = starts.new_tensor(grid).repeat(len(starts), 1, 1)
         noise = energy.noise(self.exploration_steps, len(self.probe_timesteps))
         probed = energy.mean(poses, self.probe_timesteps, noise)
         poses = _take(poses, _order(probed)[:, : max(1, poses.shape[1] // 2)])
@@ -186,18 +169,11 @@ class IDPose(Solver):
             return self._one_way(energy, pairs.reference, pairs.query, -poses, noise)
 
         steps, rate = self.exploration_steps, GradientDescent(poses, self.exploration_rate)
-        trajectory, _, valid = descend(one_direction, _same, poses, steps, rate)
+        trajectory, _, valid = descend(one_direction, lambda poses: poses, poses, steps, rate)
         trajectory = trajectory[:, :, : max(1, steps)]  # as published, what counts is the last pose before an update
         probed = energy.mean(trajectory[:, :, -1], self.probe_timesteps, noise).masked_fill(~valid, torch.nan)
         best = _order(probed)[:, : self.kept]
-        trajectory = _take(trajectory, best)
-        return Candidates(trajectory[:, :, -1], probed.gather(1, best), trajectory)
-
-    def grid(self, starts: Tensor) -> Tensor:
-        """Candidates `[B, longitudes x latitudes, 3]` at relative radius 0."""
-        longitudes = [2 * math.pi * number / self.longitudes for number in range(self.longitudes)]
-        poses = [(latitude, longitude, 0.0) for longitude in longitudes for latitude in self.latitudes]
-        return starts.new_tensor(poses).repeat(len(starts), 1, 1)
+        return _take(trajectory, best), probed.gather(1, best)
 
     # ------------------------------------------------------------ 2. selection
 
@@ -222,8 +198,11 @@ class IDPose(Solver):
 
     # ------------------------------------------------------------ 3. refinement
 
-    def refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, selected: Tensor) -> Refined:
-        """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step."""
+    def refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, selected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step.
+
+        The answers `[S, V - 1, 3]`, whether they are sound `[S]`, and the trajectories `[S, steps + 1, V - 1, 3]`.
+        """
         others, keys = selected.shape[1], on_cpu(ids)
         cycle = [pair for duo in combinations(range(others + 1), 2) for pair in (duo, duo[::-1])]  # (source, target)
         moved = self._moved(cycle, keys, energy.seed, others).to(ids.device)  # [steps, S, V]
@@ -236,21 +215,19 @@ class IDPose(Solver):
             relative = (poses[:, target] - poses[:, source])[:, None]
             return self._one_way(energy, views[:, target], views[:, source], relative, noise)
 
-        steps, flat = len(moved), selected.flatten(1)[:, None]
-        trajectory, _, valid = descend(one_pair, _same, flat, steps, GradientDescent(flat, self.refinement_rate))
+        flat = selected.flatten(1)[:, None]
+        rate = GradientDescent(flat, self.refinement_rate)
+        trajectory, _, valid = descend(one_pair, lambda poses: poses, flat, len(moved), rate)
         trajectory = trajectory[:, 0].unflatten(2, (others, 3))  # [S, steps + 1, V - 1, 3]
         # As published, a pose is recorded when the step after its update begins: the last step's never is.
         recorded = moved[:-1, :, 1:].transpose(0, 1)  # [S, steps - 1, V - 1]
         late = recorded & (recorded.flip(1).cumsum(1).flip(1) <= self.averaged)
         count = late.sum(dim=1)[..., None]
         mean = trajectory[:, 1:-1].masked_fill(~late[..., None], 0.0).sum(dim=1) / count
-        return Refined(torch.where(count > 0, mean, selected), valid[:, 0], trajectory)
+        return torch.where(count > 0, mean, selected), valid[:, 0], trajectory
 
     def _moved(self, cycle: Sequence[tuple[int, int]], ids: Tensor, seed: int, others: int) -> Tensor:
-        """Which image a step moves, `[steps, S, V]`, on the CPU.
-
-        Of the step's pair it is the image that is not the first, of two others a random one.
-        """
+        """Which image of its pair a step moves, `[steps, S, V]`: not the first; of two others a random one."""
         number = torch.arange(others * self.refinement_steps)[:, None]
         source, target = torch.tensor(cycle)[number % len(cycle)].unbind(-1)  # [steps, 1]
         coin = keyed_uniform(seed, _REFINEMENT, ids, number, count=1)[..., 0] < 0.5
@@ -292,10 +269,6 @@ def triangular_choice(alone: Tensor, between: Tensor, duos: Sequence[tuple[int, 
         total[:, i] += torch.minimum(joint.amin(dim=2), 3 * alone[:, i])
         total[:, j] += torch.minimum(joint.amin(dim=1), 3 * alone[:, j])
     return total.argmin(dim=-1)
-
-
-def _same(poses: Tensor) -> Tensor:
-    return poses
 
 
 def _order(energies: Tensor) -> Tensor:
