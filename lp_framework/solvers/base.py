@@ -135,12 +135,7 @@ def check_starts(problems: Pairs | ViewSets, starts: Tensor) -> None:
     else:
         batch = [len(problems), problems.views.shape[1] - 1]
         wanted = f"[S, V - 1, N, 3] with S = {batch[0]} and V - 1 = {batch[1]}"
-    if (
-        starts.ndim != len(batch) + 2
-        or list(starts.shape[:-2]) != batch
-        or starts.shape[-2] < 1
-        or starts.shape[-1] != 3
-    ):
+    if list(starts.shape[:-2]) != batch or starts.shape[-2] < 1 or starts.shape[-1] != 3:
         raise UserError(f"starts must be {wanted}, got {list(starts.shape)}; for one start each pass N = 1")
     if not starts.isfinite().all():
         raise UserError("starts must be finite numbers")

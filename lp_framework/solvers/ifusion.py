@@ -12,10 +12,9 @@ from lp_framework.solvers.twist import ChooseBy, DescentSettings, SineRadius, Tw
 class IFusion(TwistDescent):
     """iFusion: Adam on a twist for each start, down the prior's energy in both directions.
 
-    Defaults are the published settings; its starts are `ring`. Each step has fresh noise (without `fresh_noise` the
-    first step's) and its timestep, which falls linearly from `first_timestep` to `last_timestep`. The plateau
-    schedule is fed with the accumulated loss, as in the published code: a sum of squares does not fall, so the rate is
-    multiplied by `factor` after the first `patience` + 2 steps and then every `patience` + 1.
+    Defaults are the published settings; its starts are `ring`. The plateau schedule is fed with the accumulated loss,
+    as in the published code: a sum of squares does not fall, so the rate is multiplied by `factor` after the first
+    `patience` + 2 steps and then every `patience` + 1.
 
     `choose_by`: `accumulated`, the least sum of the losses on the way (published); `rescored`, the least mean error of
     the final poses on `rescoring` noises and timesteps that are the same for all starts of a pair.

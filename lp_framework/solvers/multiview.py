@@ -30,15 +30,6 @@ from lp_framework.solvers.twist import DescentSettings, TanhRadius, TwistPoses
 NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model does not tell it
 
 
-class Measured(NamedTuple):
-    """N measurements of each ordered pair of S sets (row: reference, column: query): relative `poses`
-    `[S, V, V, N, 3]`, their `weights` `[S, V, V, N]` (0: none), and the `passes` they took."""
-
-    poses: Tensor
-    weights: Tensor
-    passes: int
-
-
 class Joint(NamedTuple):
     """N answers to each of S sets: `poses` `[S, N, V - 1, 3]` relative to the first image, `energies`
     `[S, N, V, V]` of the ordered pairs (NaN: not looked at), `valid` `[S, N]`, and the `passes` they took."""
@@ -48,26 +39,15 @@ class Joint(NamedTuple):
     valid: Tensor
     passes: int
 
-    @classmethod
-    def at(cls, poses: Tensor, valid: Tensor, passes: int) -> Joint:
-        """Poses whose energies are not known."""
-        sets, count, others, _ = poses.shape
-        return cls(poses, poses.new_full((sets, count, others + 1, others + 1), torch.nan), valid, passes)
-
 
 @register("solver", "multiview")
 class MultiView(Solver):
     """Joint reasoning over 2 to 8 images: pairwise first stage, a robust fit of absolute poses, joint refinement.
 
-    First stage: `langevin` (`alpha`, `gamma`, `iterations`) on all ordered pairs, each from the starts of its query.
-    All their ends are measurements for `fit_views`, weighted by 1 / (d^2 + 0.1^2), with d the distance to the truth
-    that the model tells there (`choose_by=distance` of `langevin`). Second stage: as in `two_stage`, a twist for each
-    image but the first, by Adam from the fitted poses, descends the sum of the prior's energies over all ordered pairs
-    (paper, Eq. 5).
-
-    Without `first_stage` the second descends from the starts themselves, number n of all images together, and the
-    answer has the least energy on `rescoring` noises and timesteps, the same for all. Without `second_stage` the
-    answer is the fit. A pair is a set of two; with the first stage it has one answer whatever the number of starts.
+    All ends of the first stage are measurements for the fit, weighted by 1 / (d^2 + 0.1^2), with d the distance to the
+    truth that the model tells there (`choose_by=distance` of `langevin`). Without `first_stage` the second descends
+    from the starts themselves, number n of all images together, and the answer has the least energy on `rescoring`
+    noises and timesteps, the same for all. A pair is a set of two.
     """
 
     def __init__(
@@ -132,14 +112,19 @@ class MultiView(Solver):
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
         """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
         if self.first_stage:
-            joint = self.fit(self.measure(view_sets, starts, seed))
+            measured, weights, passes = self.measure(view_sets, starts, seed)
+            poses, valid = self.fit(measured, weights)
         else:
-            valid = torch.ones(len(view_sets), starts.shape[2], dtype=torch.bool, device=starts.device)
-            joint = Joint.at(starts.transpose(1, 2).clone(), valid, passes=0)
+            poses, passes = starts.transpose(1, 2).clone(), 0
+            valid = torch.ones_like(poses[:, :, 0, 0], dtype=torch.bool)
+        sets, views = view_sets.views.shape
+        joint = Joint(poses, poses.new_full((sets, poses.shape[1], views, views), torch.nan), valid, passes)
         return self.refine(view_sets, joint, seed) if self.second_stage else joint
 
-    def measure(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Measured:
-        """1. The first stage's ends on all ordered pairs, each from the starts of its query relative to its reference.
+    def measure(self, view_sets: ViewSets, starts: Tensor, seed: int) -> tuple[Tensor, Tensor, int]:
+        """1. The first stage's ends on all ordered pairs, each from the starts of its query relative to its reference:
+        relative poses `[S, V, V, N, 3]` (row: reference, column: query), their weights `[S, V, V, N]` (0: none), and
+        the passes they took.
 
         A pair with the first image as query starts from the opposite of its reference's starts.
         """
@@ -154,13 +139,13 @@ class MultiView(Solver):
         weights = torch.zeros_like(poses[..., 0])
         distance = solution.energies.unflatten(0, (sets, -1))
         weights[:, reference, query] = 1 / (distance.square() + NEAREST**2)
-        return Measured(poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes)
+        return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
-    def fit(self, measured: Measured) -> Joint:
-        """2. One answer a set; it is valid where every image has been measured with some other."""
-        poses = fit_views(measured.poses, measured.weights)[:, None, 1:].to(measured.poses)
-        known = (measured.weights > 0).any(dim=-1)
-        return Joint.at(poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True), measured.passes)
+    def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """2. One answer a set, `[S, 1, V - 1, 3]`; it is valid, `[S, 1]`, where every image has been measured."""
+        poses = fit_views(measured, weights)[:, None, 1:].to(measured)
+        known = (weights > 0).any(dim=-1)
+        return poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True)
 
     def refine(self, view_sets: ViewSets, initial: Joint, seed: int) -> Joint:
         """3. Joint descent (Eq. 5) from N sets of poses at once, by a twist for each image but the first."""

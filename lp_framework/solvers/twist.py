@@ -103,7 +103,7 @@ class DescentSettings:
 
     def check(self, prior: Prior) -> None:
         """`UserError` that names a setting which is out of range; timesteps are those of `prior`."""
-        first, last = self.first_timestep, self.last_timestep
+        first, last, known = self.first_timestep, self.last_timestep, prior.num_timesteps
         check_settings(
             "solver",
             ("learning_rate", self.learning_rate, self.learning_rate > 0, "positive"),
@@ -111,12 +111,7 @@ class DescentSettings:
             ("patience", self.patience, self.patience >= 0, "at least 0"),
             ("rescoring", self.rescoring, self.rescoring >= 1, "at least 1"),
             ("last_timestep", last, 0 <= last <= first, "from 0 to first_timestep"),
-            (
-                "first_timestep",
-                first,
-                first < prior.num_timesteps,
-                f"below the prior's {prior.num_timesteps} timesteps",
-            ),
+            ("first_timestep", first, first < known, f"below the prior's {known} timesteps"),
         )
 
     def timestep(self, done: float) -> int:

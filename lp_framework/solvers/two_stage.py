@@ -21,12 +21,9 @@ from lp_framework.solvers.twist import ChooseBy, DescentSettings, TanhRadius, Tw
 class TwoStage(Solver):
     """The paper's method: `langevin` on a score or energy model, then iFusion's descent of the prior from its ends.
 
-    Defaults are the paper's (appendix, Two Stage Optimization). First stage: `alpha`, `gamma`, `iterations`, see
-    `langevin`. Second stage: `refinement_steps` with `learning_rate`, `factor`, `patience` and timesteps that fall
-    linearly from `first_timestep` to `last_timestep`, see `ifusion`; it hands radii over by `TanhRadius`, since the
-    first stage may end at any. Without refinement steps it is the first stage alone.
-
-    The answer is the start of least second-stage energy, `choose_by` as for `ifusion`.
+    Defaults are the paper's (appendix, Two Stage Optimization); the second stage's settings are those of `ifusion`. It
+    takes radii over by `TanhRadius`, since the first stage may end at any. The answer is the start of least
+    second-stage energy. Without refinement steps it is the first stage alone.
     """
 
     def __init__(
