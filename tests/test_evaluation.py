@@ -368,7 +368,7 @@ def test_weights_of_another_size_or_model(commands):
         "wider.ckpt: its weights are of another score model: size mismatch for network."
     )
     stored(commands, "deeper.ckpt", lp_framework=recipe(commands, "model", layers=4))
-    assert "weights are of another score model: missing ['network.residual.3" in (
+    assert 'weights are of another score model: Missing key(s) in state_dict: "network.residual.3' in (
         commands.here("x", "eval", "checkpoint=deeper.ckpt").error
     )
 

@@ -22,7 +22,6 @@ from torch import Tensor
 
 import lp_framework
 from lp_framework.models.checkpoints import SHIPPED, load_model, read_checkpoint
-from lp_framework.models.model_folder import read_model_folder
 from lp_framework.priors.zero123.original import read_original
 from lp_framework.priors.zero123.safetensors_file import read_safetensors
 from lp_framework.priors.zero123.torch_file import read_state_dict
@@ -175,7 +174,7 @@ def test_a_folder_of_a_model_with_nonsense_as_weights(here):
     (here / "model.json").write_text(json.dumps({**RECIPE, "trunk": None}))
     for content in (b"", b"{}", pickle.dumps(Runs()), saved(Runs())):
         (here / "model.safetensors").write_bytes(content)
-        read_or_told(lambda: read_model_folder(here), "model.safetensors")
+        read_or_told(lambda: read_checkpoint(here / "model.safetensors"), "model.safetensors")
         assert not (here / "executed").exists()
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from lp_framework.errors import UserError, nearest
-from lp_framework.models.checkpoints import FOLDER, find_checkpoint, read_checkpoint
-from lp_framework.models.model_folder import write_model_folder
+from lp_framework.models.checkpoints import FOLDER, find_checkpoint, read_checkpoint, write_model_folder
 from lp_framework.priors.zero123.folders import write_folder
 from lp_framework.priors.zero123.networks import DTYPES, Dtype
 from lp_framework.priors.zero123.original import Averages

@@ -41,8 +41,7 @@ from lp_framework.commands.finished import with_overrides
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
-from lp_framework.models.checkpoints import BEST, FOLDER, LAST, KeepRecipe, read_checkpoint
-from lp_framework.models.model_folder import RECIPE
+from lp_framework.models.checkpoints import BEST, FOLDER, LAST, RECIPE, KeepRecipe, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.report.page import write_run_page
 from lp_framework.viz.training import save_training_picture

@@ -1,18 +1,29 @@
-"""Trained models on disk: names and numbers beside the weights, so that loading runs no code of the file."""
+"""Trained models on disk: names and numbers beside the weights, so that loading runs no code of the file.
+
+A checkpoint is a file that training wrote, or a folder, as ships with this package and as users share:
+
+model.json           the configs of model and backbone by registered name, the fingerprint of the frozen trunk
+model.safetensors    the weights
+config.yaml, metrics.csv, training.png    where they come from: the run's config with its seed, its curve
+"""
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 
 from lp_framework import registry
 from lp_framework.errors import UserError, one_line, optional_import
-from lp_framework.models.model_folder import CONFIG, RECIPE, WEIGHTS, is_recipe, read_model_folder
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import TrainedModule
 
@@ -20,6 +31,12 @@ FOLDER = "checkpoints"
 LATEST = "latest"
 LAST, BEST = "last.ckpt", "best.ckpt"
 SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
+CONFIG, WEIGHTS = "model.json", "model.safetensors"
+ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
+RECIPE = "lp_framework"  # key in a checkpoint: the configs of model and backbone
+
+
+# ---------------------------------------------------------------- reading and writing
 
 
 class KeepRecipe(Callback):
@@ -36,10 +53,10 @@ class KeepRecipe(Callback):
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The contents of a checkpoint of this framework, as tensors, numbers and text only; `UserError` for others.
 
-    `path` is a file that training wrote, or the safetensors of a model's folder (see `model_folder`).
+    `path` is a file that training wrote, or the safetensors of a model's folder.
     """
     if path.name == WEIGHTS:
-        return read_model_folder(path.parent)
+        return _read_folder(path.parent)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -48,16 +65,72 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise UserError(
             f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
         ) from error
-    if not isinstance(checkpoint, dict) or not is_recipe(checkpoint.get(RECIPE)) or not _weights_in(checkpoint):
+    weights = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
+    if (
+        not isinstance(weights, dict)
+        or not _is_recipe(checkpoint.get(RECIPE))
+        or not all(isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items())
+    ):
         raise UserError(f"{path}: is a checkpoint of something else; one that `lp train` wrote is wanted")
     return checkpoint
 
 
-def _weights_in(checkpoint: Mapping[str, Any]) -> bool:
-    weights = checkpoint.get("state_dict")
-    return isinstance(weights, dict) and all(
-        isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items()
+def _read_folder(folder: Path) -> dict[str, Any]:
+    """The checkpoint that a folder holds, weights in float32; `UserError` naming the file that is at fault."""
+    try:
+        config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        if not _is_recipe(config):
+            raise ValueError("model and backbone have no names")
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{folder / CONFIG}: is not the description of a trained model ({error})") from error
+    try:
+        with safe_open(folder / WEIGHTS, framework="pt") as file:
+            weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{folder / WEIGHTS}: is not a readable file of weights ({error})") from error
+    return {
+        RECIPE: {"model": config["model"], "backbone": config["backbone"]},
+        "trunk": config.get("trunk"),
+        "state_dict": {key: each.float() if each.is_floating_point() else each for key, each in weights.items()},
+    }
+
+
+def _is_recipe(value: Any) -> bool:
+    """Whether a value has the configs of model and backbone: settings by name, `name` among them."""
+    return isinstance(value, dict) and all(
+        isinstance(value.get(group), dict)
+        and isinstance(value[group].get("name"), str)
+        and all(isinstance(key, str) for key in value[group])
+        for group in ("model", "backbone")
     )
+
+
+def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtype: torch.dtype) -> None:
+    """Write a checkpoint (see `read_checkpoint`) of the run in `run`, floating-point weights as `dtype`.
+
+    Whole or not at all; `UserError` where the new folder cannot be written.
+    """
+    partial = folder.with_name(f"{folder.name}.partial")
+    weights = {
+        key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous()
+        for key, tensor in checkpoint["state_dict"].items()
+    }
+    config = {**checkpoint[RECIPE], "trunk": checkpoint.get("trunk")}
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        save_file(weights, partial / WEIGHTS)
+        (partial / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+        for name in ORIGIN:
+            if (run / name).is_file():
+                shutil.copyfile(run / name, partial / name)
+        partial.rename(folder)
+    except (OSError, SafetensorError) as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise UserError(f"{folder}: cannot be written: {error}") from error
+
+
+# ---------------------------------------------------------------- which one is meant
 
 
 def find_checkpoint(name: str | Path) -> Path:
@@ -136,27 +209,21 @@ def load_model(path: str | Path) -> PoseModel:
 def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
     """The trained module that a checkpoint (see `read_checkpoint`) holds; `file` names it in errors."""
     recipe = checkpoint[RECIPE]
+    kind, settings = recipe["model"]["name"], dict(recipe["backbone"])
+    if settings.get("pretrained") and not settings.get("frozen"):
+        settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
     try:
-        settings = dict(recipe["backbone"])
-        if settings.get("pretrained") and not settings.get("frozen"):
-            settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
         backbone = registry.build("backbone", settings)
         model: TrainedModule = registry.build("model", recipe["model"], backbone=backbone)
         model.on_load_checkpoint(checkpoint)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+    except Exception as error:  # constructors fail in any way at values that a file may hold
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise UserError(f"{file}: describes no model that can be built ({reason})") from error
-    kind = recipe["model"]["name"]
     try:
-        missing, unexpected = model.load_state_dict(checkpoint["state_dict"], strict=False)
-    except RuntimeError as error:  # of other shapes
-        raise UserError(
-            f"{file}: its weights are of another {kind} model: {str(error).splitlines()[-1].strip()}"
-        ) from error
-    if missing or unexpected:
-        raise UserError(
-            f"{file}: its weights are of another {kind} model: missing {missing[:2]}, unknown {unexpected[:2]}"
-        )
+        model.load_state_dict(checkpoint["state_dict"])
+    except RuntimeError as error:
+        reason = shorten(str(error).splitlines()[1], 200, placeholder=" ...")
+        raise UserError(f"{file}: its weights are of another {kind} model: {reason}") from error
     return model.eval().requires_grad_(False)
