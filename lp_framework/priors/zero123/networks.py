@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from lp_framework.errors import UserError
+from lp_framework.priors.zero123.stored_tensor import StoredTensor
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 Dtype = Literal["float32", "bfloat16", "float16"]
 
 # Configs in the words of diffusers' and transformers' config.json, and the tensors of each network by their names.
 Configs = Mapping[str, Mapping[str, Any]]
-Weights = Mapping[str, Mapping[str, Callable[[], Tensor]]]  # part -> name -> maps that tensor
+Weights = Mapping[str, Mapping[str, StoredTensor]]
 
 POSE_CHANNELS = 4  # of the conditioning vector T
 
@@ -120,7 +121,7 @@ def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> N
     return networks
 
 
-def _load(origin: str, network: nn.Module, weights: Mapping[str, Callable[[], Tensor]], dtype: torch.dtype) -> None:
+def _load(origin: str, network: nn.Module, weights: Mapping[str, StoredTensor], dtype: torch.dtype) -> None:
     expected = network.state_dict()
     missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
     if missing or unknown:
@@ -128,14 +129,16 @@ def _load(origin: str, network: nn.Module, weights: Mapping[str, Callable[[], Te
                    (("missing", missing), ("unknown", unknown)) if names]  # fmt: skip
         raise UserError(f"{origin}: its tensors are not those of Zero123: {' and '.join(reasons)}")
     tensors = {}
-    for name, mapped in weights.items():
-        tensor = mapped()
+    for name, stored in weights.items():
+        tensor = stored.map()
+        if tensor.ndim == 4 and expected[name].ndim == 2:  # a 1x1 convolution of the autoencoder's attention
+            tensor = tensor.flatten(1)
         if tensor.shape != expected[name].shape:
             shapes = f"{list(tensor.shape)} instead of {list(expected[name].shape)}"
             raise UserError(f"{origin}: '{name}' has the shape {shapes}")
         # What is stored in the wanted type stays mapped, and processes share it; else the file's bytes are let go of.
-        mapped_is_wanted = tensor.dtype == dtype and tensor.is_contiguous()
-        tensors[name] = tensor if mapped_is_wanted else torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
+        as_wanted = tensor.dtype == dtype and tensor.is_contiguous()
+        tensors[name] = tensor if as_wanted else torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
     network.load_state_dict(tensors, assign=True)
 
 
