@@ -28,16 +28,11 @@ class TrunkAndPixels:
     """What of an image is computed once: a frozen trunk's features, and the pixels of the small image after them."""
 
     def __init__(self, backbone: Backbone) -> None:
-        self.backbone = backbone
-        self.trunk_dim = backbone.trunk_dim + shrink(torch.zeros(1, 3, 1, 1)).shape[1]
+        self.backbone, self.to = backbone, backbone.to
 
     def trunk(self, images: Tensor) -> Tensor:
-        """`[I, trunk_dim]` of images `[I, 3, H, W]`."""
+        """`[I, trunk_dim + 3 * 64 * 64]` of images `[I, 3, H, W]`."""
         return torch.cat([self.backbone.trunk(images), shrink(images)], dim=1)
-
-    def to(self, device: torch.device) -> object:
-        """See `FeatureExtractor`."""
-        return self.backbone.to(device)
 
     def fingerprint(self) -> str:
         """See `FeatureExtractor`."""
@@ -134,14 +129,11 @@ class PriorModel(TrainedModule):
         """Features of the batch's views, by the head of the backbone or all of it."""
         if batch.features is None:
             return self.backbone(batch.images)
-        features: Tensor = self.backbone.head(batch.features[:, : self.backbone.trunk_dim])
-        return features
+        return self.backbone.head(batch.features[:, : self.backbone.trunk_dim])
 
     def _pixels(self, batch: PairBatch) -> Tensor:
         """Pixels of the batch's views, small."""
-        if batch.features is None:
-            return shrink(batch.images)
-        return batch.features[:, self.backbone.trunk_dim :]
+        return shrink(batch.images) if batch.features is None else batch.features[:, self.backbone.trunk_dim :]
 
     def _denoise(
         self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
+from types import ModuleType
 from typing import Any, Literal
 
 import torch
 from torch import nn
 
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.priors.zero123.stored_tensor import StoredTensor
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -76,14 +76,10 @@ PUBLISHED: Configs = {  # the sizes of Zero123 and Zero123-XL: Stable Diffusion 
 }
 
 
-def require_packages() -> None:
-    """`UserError` naming a package of the extra `zero123` that is not installed."""
-    for package in ("diffusers", "transformers", "huggingface_hub"):
-        if importlib.util.find_spec(package) is None:
-            raise UserError(
-                f"Zero123 needs the Python package '{package}', which is not installed: "
-                "pip install 'lp_framework[zero123]'"
-            )
+def packages() -> list[ModuleType]:
+    """Diffusers and transformers; `UserError` naming the one that is not installed."""
+    install = "pip install 'lp_framework[zero123]'"
+    return [optional_import(name, "Zero123", install) for name in ("diffusers", "transformers")]
 
 
 class Networks(nn.Module):
@@ -91,13 +87,11 @@ class Networks(nn.Module):
 
     def __init__(self, configs: Configs) -> None:
         super().__init__()
-        require_packages()
-        from diffusers import AutoencoderKL, UNet2DConditionModel
-        from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
-
-        self.unet = UNet2DConditionModel.from_config(dict(configs["unet"]))
-        self.vae = AutoencoderKL.from_config(dict(configs["vae"]))
-        self.image_encoder = CLIPVisionModelWithProjection(CLIPVisionConfig.from_dict(dict(configs["image_encoder"])))
+        diffusers, transformers = packages()
+        self.unet = diffusers.UNet2DConditionModel.from_config(dict(configs["unet"]))
+        self.vae = diffusers.AutoencoderKL.from_config(dict(configs["vae"]))
+        clip = transformers.CLIPVisionConfig.from_dict(dict(configs["image_encoder"]))
+        self.image_encoder = transformers.CLIPVisionModelWithProjection(clip)
         embedding = self.image_encoder.config.projection_dim
         self.cc_projection = nn.Linear(embedding + POSE_CHANNELS, self.unet.config.cross_attention_dim)
 
@@ -111,10 +105,9 @@ def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> N
         with torch.device("meta"):
             networks = Networks(configs)
     except (TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
-        raise UserError(
-            f"{origin}: its sizes are not those of Zero123's networks: {str(error).partition(chr(10))[0]}"
-        ) from error
-    _restore_buffers(networks)
+        raise UserError(f"{origin}: its sizes are not those of Zero123's networks: {one_line(error)}") from error
+    embeddings = networks.image_encoder.vision_model.embeddings  # its numbers of patches are in no file
+    embeddings.position_ids = torch.arange(embeddings.position_embedding.num_embeddings)[None]
     for part, network in networks.named_children():
         single = part == "cc_projection"  # small, and what poses pass through
         _load(f"{origin}, {part}", network, weights[part], torch.float32 if single else DTYPES[dtype])
@@ -140,10 +133,3 @@ def _load(origin: str, network: nn.Module, weights: Mapping[str, StoredTensor], 
         as_wanted = tensor.dtype == dtype and tensor.is_contiguous()
         tensors[name] = tensor if as_wanted else torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
     network.load_state_dict(tensors, assign=True)
-
-
-def _restore_buffers(networks: Networks) -> None:
-    """What is in no file and has no values on the meta device: the numbers of CLIP's patches."""
-    embeddings = networks.image_encoder.vision_model.embeddings
-    count = embeddings.position_embedding.num_embeddings
-    embeddings.register_buffer("position_ids", torch.arange(count).expand(1, -1), persistent=False)

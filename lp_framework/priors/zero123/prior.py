@@ -14,7 +14,6 @@ from lp_framework.priors.base import Prior, ViewCode
 from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, standard_normal
 from lp_framework.priors.zero123.attention import Attention, choose_attention
 from lp_framework.priors.zero123.chunks import Chunks, EnergyAndSlope
-from lp_framework.priors.zero123.conditioning import conditioning_vector
 from lp_framework.priors.zero123.cuda_graph import Replayed
 from lp_framework.priors.zero123.networks import Dtype, Networks
 from lp_framework.priors.zero123.original import Averages
@@ -26,6 +25,19 @@ STEEPER = 4096  # times the energy is differentiated, lest small slopes vanish i
 SCALE = 0.18215  # of latents before noise is added; the latent of the source is not scaled
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+
+def conditioning_vector(pose: Tensor) -> Tensor:
+    """T = [-dlatitude, sin dlongitude, cos dlongitude, dradius] `[..., 4]` of relative poses `[..., 3]`.
+
+    Zero123 (section 3.2) counts the polar angle down from the pole, so its first entry is minus the difference of
+    latitudes; iFusion's (theta, azimuth, distance) has theta = -latitude.
+
+    >>> conditioning_vector(torch.tensor([0.2, 0.0, -0.5]))
+    tensor([-0.2000,  0.0000,  1.0000, -0.5000])
+    """
+    latitude, longitude, radius = pose.unbind(-1)
+    return torch.stack([-latitude, longitude.sin(), longitude.cos(), radius], dim=-1)
 
 
 class Zero123Prior(Prior):
@@ -94,20 +106,18 @@ class Zero123Prior(Prior):
         size = [self.image_size, self.image_size]
         if list(images.shape[-2:]) != size:
             images = functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
-        encode = self.image_chunks.run
-        parts = encode(lambda part: (self._latent(images[part]), self._embedding(images[part])), len(images))
+        parts = self.image_chunks.run(lambda part: self._encode(images[part]), len(images))
         latents, embeddings = zip(*parts, strict=True)
         return ViewCode(torch.cat(latents), torch.cat(embeddings))
 
-    def _latent(self, images: Tensor) -> Tensor:
-        return self.vae.encode(images.to(self.vae.dtype)).latent_dist.mode().float()
-
-    def _embedding(self, images: Tensor) -> Tensor:
-        """The published code resizes for CLIP by bicubic interpolation with corners aligned, without antialiasing."""
+    def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        latent = self.vae.encode(images.to(self.vae.dtype)).latent_dist.mode().float()
+        # The published code resizes for CLIP by bicubic interpolation with corners aligned, without antialiasing.
         side: Any = self.image_encoder.config.image_size
         small = functional.interpolate(images.float(), [side, side], mode="bicubic", align_corners=True)
         pixels = ((small + 1) / 2 - self.clip_mean) / self.clip_std
-        return self.image_encoder(pixel_values=pixels.to(self.image_encoder.dtype)).image_embeds.float()[:, None]
+        embedding = self.image_encoder(pixel_values=pixels.to(self.image_encoder.dtype)).image_embeds.float()
+        return latent, embedding[:, None]
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
@@ -148,11 +158,10 @@ class Zero123Prior(Prior):
     ) -> Tensor:
         """See `Prior.denoising_error`. A chunk's gradient is taken with its value, so memory is that of one chunk."""
         self.check(target, source, pose, timestep, noise)
-
         inputs = pose, target.latent, source.latent, source.embedding, timestep, noise
         if pose.requires_grad and torch.is_grad_enabled():
-            replayed, function = self.replayed, self._energy_and_slope
-            both = function if replayed is None else partial(replayed, function)
+            function = self._energy_and_slope
+            both = function if self.replayed is None else partial(self.replayed, function)
             energies, _ = EnergyAndSlope.apply(pose, lambda part: both(*(each[part] for each in inputs)), self.chunks)
             return energies
         return torch.cat(self.chunks.run(lambda part: self._energy(*(each[part] for each in inputs)), len(pose)))
@@ -203,27 +212,22 @@ class Zero123Prior(Prior):
         if not guidance >= 0:
             raise UserError(f"guidance must not be negative, got {guidance}")
         token = self.token(source.embedding, pose.float())
-        return ddim_sample(
-            lambda latent, timestep: self._guided(latent, source.latent, token, timestep, guidance),
-            start.float(), self.alphas_cumprod, steps, eta, generator,
-        )  # fmt: skip
 
-    def _guided(self, latent: Tensor, condition: Tensor, token: Tensor, timestep: int, guidance: float) -> Tensor:
-        """The guided prediction; the null condition is a zero token and a zero latent."""
+        def predict(latent: Tensor, timestep: int) -> Tensor:
+            """The guided prediction; the null condition is a zero token and a zero latent."""
 
-        def predict(part: slice) -> Tensor:
-            noisy, image, context = latent[part], condition[part], token[part]
-            if guidance != 1:
-                noisy = torch.cat([noisy, noisy])
-                image = torch.cat([torch.zeros_like(image), image])
-                context = torch.cat([torch.zeros_like(context), context])
-            noise = self.predict(noisy, image, context, torch.full((len(noisy),), timestep, device=noisy.device))
-            if guidance == 1:
-                return noise
-            free, conditioned = noise.chunk(2)
-            return guided(free, conditioned, guidance)
+            def of(part: slice) -> Tensor:
+                noisy, image, context = latent[part], source.latent[part], token[part]
+                time = torch.full((len(noisy),), timestep, device=noisy.device)
+                if guidance == 1:
+                    return self.predict(noisy, image, context, time)
+                image, context = (torch.cat([torch.zeros_like(each), each]) for each in (image, context))
+                free, conditioned = self.predict(noisy.repeat(2, 1, 1, 1), image, context, time.repeat(2)).chunk(2)
+                return guided(free, conditioned, guidance)
 
-        return torch.cat(self.chunks.run(predict, len(latent)))
+            return torch.cat(self.chunks.run(of, len(latent)))
+
+        return ddim_sample(predict, start.float(), self.alphas_cumprod, steps, eta, generator)
 
 
 @register("prior", "zero123")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lp_framework.errors import UserError, one_line
 from lp_framework.priors.zero123 import folders
-from lp_framework.priors.zero123.networks import Dtype, Networks, assemble, require_packages
+from lp_framework.priors.zero123.networks import Dtype, Networks, assemble, packages
 from lp_framework.priors.zero123.original import Averages, read_original
 
 HUB_ID = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*")
@@ -19,7 +19,7 @@ def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dty
     `weights` chooses between a checkpoint's moving averages and its raw weights; a folder holds one of them, chosen
     when it was made. Raises `UserError` where the weights cannot be had or do not fit.
     """
-    require_packages()
+    packages()
     place = Path(path)
     if not place.exists() and HUB_ID.fullmatch(path) and place.suffix not in (".ckpt", ".pt", ".pth"):
         place = download(path, revision)
