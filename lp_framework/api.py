@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lp_framework import catalogue, registry
 from lp_framework.data.pairs import as_images
-from lp_framework.data.photographs import BackgroundRemover, array_image, on_white, prepare, read_image, upright
+from lp_framework.data.photographs import array_image, on_white, prepare, read_image, upright
 from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import load_model as read_model
 from lp_framework.models.pose_model import PoseModel
@@ -49,9 +49,8 @@ def estimate_pose(
     the prior and the model that it asks for (`model` is weights that ship, a checkpoint, a run's folder or a model)
     on the GPU, where there is one; a built solver has its own.
     """
-    remover = BackgroundRemover() if remove_background else None
     prepared = [
-        prepare(open_picture(picture, name), name, remover=remover, crop=crop)
+        prepare(open_picture(picture, name), name, remove_background=remove_background, crop=crop)
         for picture, name in ((reference, _name(reference, "reference")), (query, _name(query, "query")))
     ]
     if isinstance(solver, str):

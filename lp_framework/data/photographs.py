@@ -4,20 +4,18 @@ Where the object is, an image's own alpha channel says, a mask file, or rembg. T
 (`load_and_preprocess`): the longest side of the object's bounding box becomes 200 of the image's 256 pixels, its centre
 the image's. Background is what is less than half opaque, as in the code of iFusion and ID-Pose.
 
-What a crop does to the camera: the prepared image is, nearly, that of a *virtual* camera with the field of view of the
-priors (49.1 degrees) at the same viewpoint, turned so that it looks at the object's centre, and moved along its line
-of sight until the object fills that share of the frame. Latitude and longitude are the photograph's, up to the
-perspective of an object off the image's centre or very near. The distance is not: how far away the real camera stood,
-and its focal length, are lost. A relative radius compares two virtual cameras, each of which sees the object fill the
-same share: it is about 0 where the object looks as large from both, negative where the query sees a shorter side.
+The prepared image is, nearly, that of a *virtual* camera with the field of view of the priors at the same viewpoint,
+turned to the object's centre and moved along its line of sight until the object fills that share of the frame. So
+latitude and longitude are the photograph's; distance and focal length are lost, and a relative radius compares two
+virtual cameras: it is about 0 where the object looks as large from both.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -45,15 +43,11 @@ def photograph_files(images: str | Path | Sequence[str | Path]) -> list[Path]:
             what = "is one image, two or more are needed" if folder.exists() else "there is no such folder"
             raise UserError(f"images={folder}: {what}; give a list, images=[A.png,B.png], or a folder")
         files = _images_in(folder)
-        if len(files) < 2:
-            known = ", ".join(SUFFIXES)
-            raise UserError(f"images={folder}: two or more images are needed, it holds {len(files)} ({known})")
-        return files
-    files = [Path(str(image)) for image in images]
+    else:
+        files = [Path(str(image)) for image in images]
     if len(files) < 2:
-        raise UserError(
-            f"images: two or more files are needed, got {len(files)}; give images=[A.png,B.png] or a folder"
-        )
+        known = ", ".join(SUFFIXES)
+        raise UserError(f"images={images}: two or more are needed, got {len(files)}; give a list or a folder ({known})")
     return files
 
 
@@ -128,38 +122,31 @@ def array_image(array: ArrayLike, name: str) -> Image.Image:
 # ---------------------------------------------------------------- cutting out
 
 
-class BackgroundRemover:
-    """Finds the object by rembg (MIT licence) with the network U^2-Net (Apache-2.0).
+@cache
+def _background_remover() -> Callable[[Image.Image], Image.Image]:
+    """The opacity ("L") of what is in an image, by rembg (MIT licence) with the network U^2-Net (Apache-2.0).
 
-    It is loaded at the first image; rembg then downloads the weights (176 MB) unless it has done so before.
+    rembg downloads the weights (176 MB) unless it has done so before.
     """
-
-    def mask(self, image: Image.Image) -> Image.Image:
-        """The object's opacity, "L", in an image."""
-        remove, session = self._rembg
-        mask: Image.Image = remove(image.convert("RGB"), session=session, only_mask=True)
-        return mask
-
-    @cached_property
-    def _rembg(self) -> tuple[Any, Any]:
-        try:
-            from rembg import new_session, remove
-        except (ImportError, SystemExit):  # without onnxruntime it exits
-            raise UserError("remove_background=true needs rembg: pip install 'lp_framework[masks]'") from None
-        try:
-            return remove, new_session("u2net")  # its default network is not free for commercial use
-        except (OSError, ValueError) as error:
-            raise UserError(f"the weights of rembg's u2net cannot be had ({error})") from error
+    try:
+        from rembg import new_session, remove
+    except (ImportError, SystemExit):  # without onnxruntime it exits
+        raise UserError("remove_background=true needs rembg: pip install 'lp_framework[masks]'") from None
+    try:
+        session = new_session("u2net")  # its default network is not free for commercial use
+    except (OSError, ValueError) as error:
+        raise UserError(f"the weights of rembg's u2net cannot be had ({error})") from error
+    return partial(remove, session=session, only_mask=True)
 
 
 def cut_out(
     image: Image.Image,
     name: str,
     mask: Image.Image | None = None,
-    remover: BackgroundRemover | None = None,
+    remove_background: bool = False,
     required: bool = True,
 ) -> Image.Image:
-    """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else `remover`.
+    """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else rembg.
 
     Where none of them is to be had that is a `UserError` if `required`, else the whole image is opaque. `UserError`,
     too, for a mask of another size or without background; `name` is what errors call the image.
@@ -170,13 +157,15 @@ def cut_out(
             raise UserError(
                 f"{name}: is {image.width} x {image.height} pixels but its mask is {mask.width} x {mask.height}"
             )
-        opacity = _marked(mask)
+        # What is opaque in a mask with transparency, what is bright in any other.
+        opacity = _opacity(mask.getchannel("A")) if mask.mode == "RGBA" else None
+        opacity = opacity or _opacity(mask.convert("L"))
         if opacity is None:
             raise UserError(f"{name}: its mask marks no background, which must be black")
     elif image.mode == "RGBA":
         opacity = _opacity(image.getchannel("A"))
-    if opacity is None and remover is not None:
-        opacity = _opacity(remover.mask(image))
+    if opacity is None and remove_background:
+        opacity = _opacity(_background_remover()(image.convert("RGB")))
         if opacity is None:
             raise UserError(f"{name}: rembg finds no background in it; give a mask")
     if opacity is None and required:
@@ -187,12 +176,6 @@ def cut_out(
     result = image.convert("RGB")
     result.putalpha(255 if opacity is None else opacity)
     return result
-
-
-def _marked(mask: Image.Image) -> Image.Image | None:
-    """What a mask marks: the opaque part of one with transparency, the bright part of any other."""
-    opacity = _opacity(mask.getchannel("A")) if mask.mode == "RGBA" else None
-    return opacity or _opacity(mask.convert("L"))
 
 
 def _opacity(levels: Image.Image) -> Image.Image | None:
@@ -236,7 +219,7 @@ def prepare(
     image: Image.Image,
     name: str,
     mask: Image.Image | None = None,
-    remover: BackgroundRemover | None = None,
+    remove_background: bool = False,
     crop: bool = True,
 ) -> Image.Image:
     """A photograph prepared, RGBA of `SIZE` pixels a side; see `cut_out` and `crop_to_object`.
@@ -244,10 +227,10 @@ def prepare(
     Without `crop` the whole image is kept, which must be square; one without background then shows the object on white.
     """
     if crop:
-        return crop_to_object(cut_out(image, name, mask, remover), name)
+        return crop_to_object(cut_out(image, name, mask, remove_background), name)
     if image.width != image.height:
         raise UserError(f"{name}: is {image.width} x {image.height} pixels; without crop an image must be square")
-    whole = cut_out(image, name, mask, remover, required=False)
+    whole = cut_out(image, name, mask, remove_background, required=False)
     return whole.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
 
 
@@ -261,20 +244,19 @@ def prepared_photographs(
     for name, value in (("remove_background", remove_background), ("crop", crop)):
         if not isinstance(value, bool):
             raise UserError(f"{name} must be true or false, got {value}")
-    found = [None] * len(files) if masks is None else mask_files(files, masks)
+    found = mask_files(files, masks) if masks is not None else [None] * len(files)
     images = [read_image(file) for file in files]
-    opened = [None if mask is None else read_image(mask) for mask in found]
-    remover = BackgroundRemover() if remove_background else None
+    cuts = [None if mask is None else read_image(mask) for mask in found]
     return [
-        prepare(image, str(file), mask, remover, crop) for file, image, mask in zip(files, images, opened, strict=True)
+        prepare(image, str(file), mask, remove_background, crop)
+        for file, image, mask in zip(files, images, cuts, strict=True)
     ]
 
 
 def on_white(image: Image.Image) -> NDArray[np.uint8]:
     """Pixels `[H, W, 3]` of an RGBA image composed over white."""
     white = Image.new("RGBA", image.size, "white")
-    white.alpha_composite(image)
-    return np.asarray(white.convert("RGB"))
+    return np.asarray(Image.alpha_composite(white, image).convert("RGB"))
 
 
 def save_png(path: Path, image: Image.Image) -> None:
