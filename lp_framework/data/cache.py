@@ -21,12 +21,11 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from lp_framework.data.photographs import opened
+from lp_framework.data.photographs import on_white, opened
 from lp_framework.data.views import DEPTH_UNIT
 from lp_framework.errors import UserError
 
 T = TypeVar("T")
-_CHUNK = 1 << 24  # bytes a checksum step
 
 
 def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], Iterable[NDArray]]) -> NDArray:
@@ -51,10 +50,11 @@ def _write(folder: Path, key: str, count: int, blocks: Iterable[NDArray]) -> Non
     try:
         for block in blocks:
             if array is None:
-                array = np.lib.format.open_memmap(
-                    partial, mode="w+", dtype=block.dtype, shape=(count, *block.shape[1:])
-                )
-                _reserve(partial)
+                shape = (count, *block.shape[1:])
+                array = np.lib.format.open_memmap(partial, mode="w+", dtype=block.dtype, shape=shape)
+                if hasattr(os, "posix_fallocate"):  # not on macOS; a mapped page that finds the disk full is a SIGBUS
+                    with partial.open("r+b") as file:
+                        os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
             array[place : place + len(block)] = block
             place += len(block)
         if array is None or place != count:
@@ -70,13 +70,6 @@ def _write(folder: Path, key: str, count: int, blocks: Iterable[NDArray]) -> Non
         note.unlink(missing_ok=True)
 
 
-def _reserve(file: Path) -> None:
-    """Give a sparse file its disk space: where a mapped page finds the disk full, the process dies of a SIGBUS."""
-    if hasattr(os, "posix_fallocate"):  # not on macOS
-        with file.open("r+b") as opened:
-            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
-
-
 def _intact(folder: Path, key: str, count: int) -> bool:
     try:
         record = json.loads((folder / f"{key}.json").read_text())
@@ -88,11 +81,7 @@ def _intact(folder: Path, key: str, count: int) -> bool:
 
 
 def _checksum(array: NDArray) -> int:
-    flat = array.reshape(-1).view(np.uint8)
-    checksum = 0
-    for start in range(0, len(flat), _CHUNK):
-        checksum = zlib.crc32(flat[start : start + _CHUNK].data, checksum)
-    return checksum
+    return zlib.crc32(array.reshape(-1).view(np.uint8).data)
 
 
 def tracked(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
@@ -118,13 +107,12 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path) -> tuple
     Raises `UserError` naming the file for an image that does not decode, is not square, or differs in size from the
     others of its folder.
     """
-    key = content_key(files, "views", size)
 
     def decode(image: Image.Image) -> NDArray:
-        white = Image.new("RGBA", image.size, "white")
-        white.alpha_composite(image.convert("RGBA"))
-        return np.asarray(white.convert("RGB").resize((size, size), Image.Resampling.BOX, reducing_gap=None))
+        white = Image.fromarray(on_white(image.convert("RGBA")))
+        return np.asarray(white.resize((size, size), Image.Resampling.BOX))
 
+    key = content_key(files, "views", size)
     return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))
 
 
@@ -143,9 +131,7 @@ def decoded_depths(files: Sequence[Path], size: int, folder: str | Path) -> NDAr
     units, 0 where there is nothing; of the sample nearest to each pixel. `UserError` where a view has none."""
     depths = [file.parents[1] / "depth" / file.name for file in files]
     if missing := [file for file in depths if not file.is_file()]:
-        raise UserError(
-            f"{missing[0]}: there is no such file; views that are rendered with data.depth=true have depths"
-        )
+        raise UserError(f"{missing[0]}: there is no such file; views rendered with data.depth=true have depths")
 
     def decode(image: Image.Image) -> NDArray:
         levels = np.asarray(image.resize((size, size), Image.Resampling.NEAREST))
@@ -160,14 +146,11 @@ def _decoded(files: Sequence[Path], decode: Callable[[Image.Image], NDArray], de
     sizes: dict[Path, tuple[int, int]] = {}
     for file in tracked(files, description):
         with opened(file) as image:
-            width, height = image.size
-            if width != height:
-                raise UserError(f"{file}: is {width} x {height} pixels; views must be square")
-            expected = sizes.setdefault(file.parent, image.size)
-            if image.size != expected:
-                raise UserError(
-                    f"{file}: is {width} x {height} pixels, the other images of its folder are "
-                    f"{expected[0]} x {expected[1]}"
-                )
+            told = f"{file}: is {image.width} x {image.height} pixels"
+            if image.width != image.height:
+                raise UserError(f"{told}; views must be square")
+            width, height = sizes.setdefault(file.parent, image.size)
+            if image.size != (width, height):
+                raise UserError(f"{told}, the other images of its folder are {width} x {height}")
             block = decode(image)[None]
         yield block
