@@ -24,7 +24,7 @@ from test_solver_contract import SOLVERS, build
 from tiny_runs import Commands
 
 from lp_framework import api, load_prior, registry
-from lp_framework.benchmarks.second_stage import NARROW, random_pair
+from lp_framework.benchmarks.zero123 import NARROW, random_pair
 from lp_framework.commands.eval_pictures import save_pictures
 from lp_framework.data.pairs import PairData
 from lp_framework.evaluation.evaluation import Evaluation

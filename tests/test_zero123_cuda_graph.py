@@ -13,7 +13,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from lp_framework.benchmarks.second_stage import NARROW
+from lp_framework.benchmarks.zero123 import NARROW
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.zero123 import cuda_graph
 from lp_framework.priors.zero123.chunks import Chunks

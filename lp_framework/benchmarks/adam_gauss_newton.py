@@ -1,16 +1,15 @@
-"""Gauss-Newton against Adam on the prior's energy: what each needs to reach the same energy."""
+"""Gauss-Newton against Adam on the prior's energy: the passes that each needs to reach the same energy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 
-from lp_framework.benchmarks.harness import Contest, Section, worth
-from lp_framework.benchmarks.second_stage import encoded
+from lp_framework.benchmarks.harness import Section
+from lp_framework.benchmarks.zero123 import encoded
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairData
 from lp_framework.models.pose_model import PoseModel
@@ -22,7 +21,7 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 
-NEWTON, ADAM = "Gauss-Newton", "Adam"
+CONTENDERS = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
 # What both are judged by: the energy under timesteps and noises that neither descends.
 PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
 PROBE_NOISES = 2  # a timestep
@@ -50,55 +49,36 @@ def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
 
 
 def measure(
-    data: PairDataModule,
-    model: PoseModel,
-    prior: Prior,
-    names: Mapping[str, str],
-    pairs: int,
-    starts: int,
-    gammas: Sequence[float],
-    newton_steps: int,
-    adam_steps: int,
-    rounds: int,
-    device: torch.device,
-) -> Iterator[Section]:
+    section: Section, data: PairDataModule, model: PoseModel, prior: Prior, pairs: int, starts: int,
+    gammas: Sequence[float], newton_steps: int, adam_steps: int,
+) -> None:  # fmt: skip
     """Descents on `pairs` of the test views from where the first stage ends under each of `gammas`.
 
-    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach. Seconds are those
-    of a whole descent, by the share of its passes.
+    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach.
     """
-    model, prior, chosen = model.to(device), prior.to(device), some_pairs(data.data("test"), pairs, device)
+    chosen = some_pairs(data.data("test"), pairs, section.device)
     ready = encoded(prior, prior.encode(chosen.images))
     newton = GaussNewton(model, ready, refinement_steps=newton_steps, trajectory=True)
     adam = TwoStage(model, ready, refinement_steps=adam_steps, trajectory=True).second
-    section = Section("second stage: Gauss-Newton and Adam", (NEWTON, ADAM))
-    section.note = f"{len(chosen)} pairs of {names['data']}'s test views, {starts} starts, prior={names['prior']}"
-    contests = []
+    section.note = f"{len(chosen)} pairs of test views, {starts} starts"
     for gamma in gammas:
         poses = Ring(starts).make(chosen, seed=0)
         ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(chosen, poses, seed=0).poses
-        descents = {
-            NEWTON: followed(ready, chosen, newton.refine(chosen, ends, 0), looks=1),
-            ADAM: followed(ready, chosen, adam.solve(chosen, ends, 0), looks=0),
-        }
-        level = max(min(descent.energies) for descent in descents.values())
-        steps = {name: descent.reached(level) for name, descent in descents.items()}
-        passes = [descent.passes[steps[name]] for name, descent in descents.items()]
-        shares = [its / descent.passes[-1] for its, descent in zip(passes, descents.values(), strict=True)]
-        label = f"gamma {gamma:g} before, to equal energy"
-        section.add(f"{label}: passes a start", *passes)
-        section.facts[f"gamma {gamma:g}"] = {
-            "energy": {"start": descents[ADAM].energies[0], "equal": level},
-            "steps": steps,
-            "energies": {name: list(descent.energies) for name, descent in descents.items()},
-        }
-        # A whole descent is worth more starts than it has where a share of it is enough.
-        first, second = (
-            worth(len(chosen) * starts / 1000 / share, partial(solve, chosen, ends, 0))
-            for solve, share in zip((newton.refine, adam.solve), shares, strict=True)
+        descents = (
+            followed(ready, chosen, newton.refine(chosen, ends, 0), looks=1),
+            followed(ready, chosen, adam.solve(chosen, ends, 0), looks=0),
         )
-        contests.append(Contest(f"{label}: seconds a 1000 starts", first, second))
-    return section.race(contests, rounds, device)
+        level = max(min(descent.energies) for descent in descents)
+        steps = [descent.reached(level) for descent in descents]
+        passes = [descent.passes[step] for descent, step in zip(descents, steps, strict=True)]
+        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *passes)
+        names = section.contenders
+        section.facts[f"gamma {gamma:g}"] = {
+            "energy": {"start": descents[1].energies[0], "equal": level},
+            "steps": dict(zip(names, steps, strict=True)),
+            "energies": {name: list(descent.energies) for name, descent in zip(names, descents, strict=True)},
+        }
+        section.changed()
 
 
 def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> Descent:

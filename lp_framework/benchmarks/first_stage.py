@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from itertools import permutations
 
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Contest, Section, Work, worth
-from lp_framework.errors import UserError
+from lp_framework.benchmarks.harness import Section, Work, worth
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.starts import Ring
 
-BATCHED, LOOP = "batched", "plain loop"
+CONTENDERS = "first stage: langevin", ("batched", "plain loop")
 
 
 @torch.no_grad()
@@ -39,25 +37,20 @@ def plain_loop(solver: Langevin, pairs: Pairs, starts: Tensor) -> Tensor:
     return ends
 
 
-def measure(model: PoseModel, views: int, starts: int, rounds: int, device: torch.device) -> Iterator[Section]:
+def measure(section: Section, model: PoseModel, views: int, starts: int, rounds: int) -> None:
     """On all ordered pairs of `views` random images, `starts` each, and on one of these pairs."""
-    if views < 2:
-        raise UserError(f"first_stage.views must be at least 2, got {views}")
-    solver = Langevin(model.to(device))
+    solver = Langevin(model)
 
     def works(pairs: Pairs) -> tuple[Work, Work]:
         poses, amount = Ring(starts).make(pairs, seed=0), len(pairs) * starts
         loop = partial(plain_loop, solver, pairs, poses)
         return worth(amount, partial(solver.solve, pairs, poses, 0)), worth(amount, loop)
 
-    every = all_pairs(model.backbone.image_size, views, device)
+    every = all_pairs(model.backbone.image_size, max(2, views), section.device)
     one = Pairs(every.images[:2], every.reference[:1], every.query[:1], every.ids[:1])
-    contests = [
-        Contest(f"{label}, starts a second", *works(pairs), rate=True)
-        for pairs, label in ((one, "1 pair"), (every, f"{len(every)} pairs of {views} images"))
-    ]
-    note = f"{solver.iterations} iterations from {starts} starts a pair; each contender encodes the images it needs"
-    return Section("first stage: langevin", (BATCHED, LOOP), note).race(contests, rounds, device)
+    named = {"1 pair": one, f"{len(every)} pairs of {len(every.images)} images": every}
+    section.note = f"{solver.iterations} iterations from {starts} starts a pair; each encodes the images it needs"
+    section.race({f"{label}, starts a second": works(pairs) for label, pairs in named.items()}, rounds, rate=True)
 
 
 def all_pairs(side: int, views: int, device: torch.device) -> Pairs:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -15,20 +15,10 @@ Work = Callable[[], float]  # does it, and returns how many of the row's unit we
 _Result = TypeVar("_Result")
 
 
-class Contest(NamedTuple):
-    """Work that both contenders do; its row holds seconds a unit, or units a second if it is a `rate`."""
-
-    label: str  # of the row, with the unit
-    first: Work
-    second: Work
-    rate: bool = False
-
-
 @dataclass(frozen=True)
 class Row:
-    """A quantity, named with its unit: of either contender a value a round, or a single one."""
+    """A quantity of two contenders, of each a value a round, or a single one."""
 
-    label: str
     first: list[float] = field(default_factory=list)
     second: list[float] = field(default_factory=list)
 
@@ -46,56 +36,56 @@ class Row:
 
 @dataclass
 class Section:
-    """A measurement so far: `rows` for the table, `facts` for the JSON file alone, `done` in [0, 1]."""
+    """A measurement so far: `rows` by label with their unit, `facts` for the JSON file alone.
+
+    `changed` is called after every stretch of work.
+    """
 
     title: str
     contenders: tuple[str, str]
+    device: torch.device
+    changed: Callable[[], None] = lambda: None
     note: str = ""
-    races: int = 1  # how many there will be
-    rows: list[Row] = field(default_factory=list)
+    rows: dict[str, Row] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
-    done: float = 0.0
 
     def race(
-        self, contests: Sequence[Contest], rounds: int, device: torch.device, warm_up: bool = True
-    ) -> Iterator[Section]:
-        """The section after every stretch: each work once to warm up, then `rounds` of all of them in turn."""
-        rows = [Row(contest.label) for contest in contests]
-        self.rows += rows
-        for contest in contests if warm_up else ():
-            contest.first()
-            contest.second()
+        self, works: Mapping[str, tuple[Work, Work]], rounds: int, rate: bool = False, warm_up: bool = True
+    ) -> None:
+        """Each work once to warm up, then `rounds` of all of them in turn.
+
+        `works` are the two contenders' by the row's label; values are seconds a unit, units a second if it is a `rate`.
+        """
+        for first, second in works.values() if warm_up else ():
+            first()
+            second()
         for _ in range(rounds):
-            for contest, row in zip(contests, rows, strict=True):
-                for work, values in ((contest.first, row.first), (contest.second, row.second)):
-                    seconds, amount = timed(work, device)
-                    values.append(amount / seconds if contest.rate else seconds / amount)
-                    self.done += 1 / (2 * rounds * len(contests) * self.races)
-                    yield self
+            for label, both in works.items():
+                row = self.rows.setdefault(label, Row())
+                for work, values in zip(both, (row.first, row.second), strict=True):
+                    seconds, amount = timed(work, self.device)
+                    values.append(amount / seconds if rate else seconds / amount)
+                    self.changed()
 
     def add(self, label: str, first: float, second: float) -> None:
         """A row of single values."""
-        self.rows.append(Row(label, [first], [second]))
+        self.rows[label] = Row([first], [second])
 
-    def measured(self) -> list[Row]:
+    def measured(self) -> dict[str, Row]:
         """The rows of which both contenders have a value."""
-        return [row for row in self.rows if row.first and row.second]
+        return {label: row for label, row in self.rows.items() if row.first and row.second}
 
     def record(self) -> dict[str, Any]:
         """For the JSON file: by the labels of the rows, and the facts."""
+        first, second = self.contenders
         rows = {
-            row.label: {
-                **{
-                    name: _spread(values) for name, values in zip(self.contenders, (row.first, row.second), strict=True)
-                },
-                "ratio": row.ratio,
-            }
-            for row in self.measured()
+            label: {first: _spread(row.first), second: _spread(row.second), "ratio": row.ratio}
+            for label, row in self.measured().items()
         }
         return {**rows, **self.facts}
 
 
-def _spread(values: Sequence[float]) -> dict[str, Any]:
+def _spread(values: list[float]) -> dict[str, Any]:
     return {"median": median(values), "min": min(values), "max": max(values), "rounds": list(values)}
 
 

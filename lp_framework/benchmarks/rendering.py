@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -13,27 +13,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Contest, Section, worth
+from lp_framework.benchmarks.harness import Section, worth
 from lp_framework.data.meshes import load_scene
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.toy import toy_objects
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError, nearest
 from lp_framework.geometry import camera_to_world
 
-ONCE, LOOP = "mesh loaded once", "for every view"
-FIELD_OF_VIEW_DEGREES = 49.1
+CONTENDERS = "rendering: views of a mesh file", ("mesh loaded once", "for every view")
 
 
 def measure(
-    object: str, renderers: Mapping[str, Renderer], views: int, resolution: int, rounds: int, device: torch.device
-) -> Iterator[Section]:
+    section: Section, object: str, renderers: Mapping[str, Renderer], views: int, resolution: int, rounds: int
+) -> None:
     """Views around an embedded object, from a mesh file (GLB); renderers that cannot work are named in the note."""
     objects = {each.name: each for each in toy_objects()}
     if object not in objects:
         known = f"{nearest(object, objects)} (known: {', '.join(objects)})"
         raise UserError(f"rendering.object={object} is none of the embedded objects{known}")
-    mesh = objects[object].load()
-    cameras, contests, missing = around(views), [], []
+    mesh, cameras = objects[object].load(), around(views)
+    works, missing = {}, []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{object}.glb"
         mesh.export(file)
@@ -43,15 +43,10 @@ def measure(
             except UserError as error:
                 missing.append(str(error))
                 continue
-            once, each_time = (
-                worth(views, partial(draw, renderer, file, cameras, resolution))
-                for draw in (views_once, views_each_time)
-            )
-            contests.append(Contest(f"{name}, views a second", once, each_time, rate=True))
-        if not contests:
-            raise UserError(f"there is nothing to render with here: {'; '.join(missing)}")
-        note = "; ".join([f"{object}, {views} views of {resolution} x {resolution} pixels", *missing])
-        yield from Section("rendering: views of a mesh file", (ONCE, LOOP), note).race(contests, rounds, device)
+            once, each_time = (partial(draw, renderer, file, cameras, resolution) for draw in (drawn, drawn_one_by_one))
+            works[f"{name}, views a second"] = worth(views, once), worth(views, each_time)
+        section.note = "; ".join([f"{object}, {views} views of {resolution} x {resolution} pixels", *missing])
+        section.race(works, rounds, rate=True)
 
 
 def around(views: int) -> Tensor:
@@ -61,11 +56,11 @@ def around(views: int) -> Tensor:
     return camera_to_world(torch.stack(poses, dim=-1))
 
 
-def views_once(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
+def drawn(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
     """Views `[V, H, W, 4]` of a mesh file that is loaded once."""
     return renderer.render(load_scene(file), cameras, resolution, FIELD_OF_VIEW_DEGREES)
 
 
-def views_each_time(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
+def drawn_one_by_one(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
     """The same as a plain loop, which loads the file for every view."""
-    return np.concatenate([views_once(renderer, file, each[None], resolution) for each in cameras])
+    return np.concatenate([drawn(renderer, file, each[None], resolution) for each in cameras])

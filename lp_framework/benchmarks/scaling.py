@@ -3,86 +3,66 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from statistics import median
 
 import numpy as np
 import torch
 
+from lp_framework.benchmarks.counting import peak_bytes
 from lp_framework.benchmarks.first_stage import random_images
 from lp_framework.benchmarks.harness import Row, Section, timed
-from lp_framework.benchmarks.memory import peak_bytes
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs, ViewSets
+from lp_framework.solvers.base import ViewSets
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import TwoStage
 
-MOST, LEAST = "most", "fewest"
+CONTENDERS = "scaling: two_stage", ("most", "fewest")
 
 
 def measure(
-    model: PoseModel,
-    prior: Prior,
-    pairs: Sequence[int],
-    starts: Sequence[int],
-    views: Sequence[int],
-    fixed: Mapping[str, int],
-    steps: int,
-    rounds: int,
-    device: torch.device,
-) -> Iterator[Section]:
-    """The section after every size: both stages, `steps` steps each, on random images; what does not grow is `fixed`.
+    section: Section, model: PoseModel, prior: Prior, pairs: Sequence[int], starts: Sequence[int],
+    views: Sequence[int], fixed: Mapping[str, int], steps: int, rounds: int,
+) -> None:  # fmt: skip
+    """Both stages, `steps` steps each, on random images; of pairs, starts and views those that do not grow are `fixed`.
 
-    Pairs have two images each; a set of views is a first view and so many others, each paired with the first.
+    A set of views is a first view and so many others, each paired with the first; pairs are sets with one other.
     """
-    for name, listed in (("pairs", pairs), ("starts", starts), ("views", views)):
-        if len(listed) < 2 or list(listed) != sorted(set(listed)):
-            raise UserError(f"scaling.{name} must list two or more ascending numbers, got {list(listed)}")
-    solver = TwoStage(model.to(device), prior.to(device), iterations=steps, refinement_steps=steps)
-    works = {
-        "pairs": {size: _solving(solver, size, fixed["starts"], device) for size in pairs},
-        "starts": {size: _solving(solver, fixed["pairs"], size, device) for size in starts},
-        "views": {size: _solving_views(solver, fixed["sets"], size, fixed["starts"], device) for size in views},
+    solver = TwoStage(model, prior, iterations=steps, refinement_steps=steps)
+    solving = partial(_solving, solver, section.device)
+    works: dict[str, dict[int, Callable[[], object]]] = {
+        "pairs": {size: solving(size, 1, fixed["starts"]) for size in pairs},
+        "starts": {size: solving(fixed["pairs"], 1, size) for size in starts},
+        "views": {size: solving(fixed["sets"], size, fixed["starts"]) for size in views},
     }
-    section = Section("scaling: two_stage", (MOST, LEAST))
+    for name, sizes in works.items():
+        if len(sizes) < 2:
+            raise UserError(f"scaling.{name} must list two or more numbers, got {list(sizes)}")
     section.note = f"both stages, {steps} steps each; what does not grow is "
     section.note += ", ".join(f"{value} {name}" for name, value in fixed.items())
     section.note += "; cost ~ number^exponent, 1 is linear"
-    peaks = {name: {size: peak_bytes(work, device) for size, work in sizes.items()} for name, sizes in works.items()}
-    seconds: dict[str, dict[int, list[float]]] = {name: {size: [] for size in sizes} for name, sizes in works.items()}
-    for _ in range(rounds):
-        for name, sizes in works.items():
-            for size, work in sizes.items():
-                seconds[name][size].append(timed(work, device)[0])
-                section.done += 1 / (rounds * sum(map(len, works.values())))
-                yield section
     for name, sizes in works.items():
-        least, most, costs = min(sizes), max(sizes), seconds[name]
-        slopes = exponent({size: median(each) for size, each in costs.items()}), exponent(peaks[name])
+        peaks = {size: peak_bytes(work, section.device) for size, work in sizes.items()}
+        seconds: dict[int, list[float]] = {size: [] for size in sizes}
+        for _ in range(rounds):
+            for size, work in sizes.items():
+                seconds[size].append(timed(work, section.device)[0])
+        medians = {size: median(each) for size, each in seconds.items()}
+        slopes = {"seconds": exponent(medians), "peak_bytes": exponent(peaks)}
+        least, most = min(sizes), max(sizes)
         label = f"{least} to {most} {name}"
-        section.rows.append(Row(f"{label}: seconds, exponent {slopes[0]:.2f}", costs[most], costs[least]))
-        memory = peaks[name][most] / 1e6, peaks[name][least] / 1e6
-        section.add(f"{label}: peak memory, MB, exponent {slopes[1]:.2f}", *memory)
-        section.facts[name] = {
-            "sizes": {size: {"seconds": median(costs[size]), "peak_bytes": peaks[name][size]} for size in sizes},
-            "exponent": {"seconds": slopes[0], "peak_bytes": slopes[1]},
-        }
-    yield section
+        section.rows[f"{label}: seconds, exponent {slopes['seconds']:.2f}"] = Row(seconds[most], seconds[least])
+        memory = f"{label}: peak memory, MB, exponent {slopes['peak_bytes']:.2f}"
+        section.add(memory, peaks[most] / 1e6, peaks[least] / 1e6)
+        costs = {size: {"seconds": medians[size], "peak_bytes": peaks[size]} for size in sizes}
+        section.facts[name] = {"sizes": costs, "exponent": slopes}
+        section.changed()
 
 
-def _solving(solver: TwoStage, pairs: int, starts: int, device: torch.device) -> Callable[[], object]:
-    """Solves so many pairs from so many starts each."""
-    index = torch.arange(pairs, device=device)
-    images = random_images(2 * pairs, solver.prior.image_size, device)
-    problem = Pairs(images, 2 * index, 2 * index + 1, ids=index)
-    poses = Ring(starts).make(problem, seed=0)
-    return partial(solver.solve, problem, poses, 0)
-
-
-def _solving_views(solver: TwoStage, sets: int, views: int, starts: int, device: torch.device) -> Callable[[], object]:
+def _solving(solver: TwoStage, device: torch.device, sets: int, views: int, starts: int) -> Callable[[], object]:
     """Solves sets of a first view and so many others."""
     places = torch.arange(sets * (views + 1), device=device).view(sets, views + 1)
     images = random_images(places.numel(), solver.prior.image_size, device)
@@ -97,5 +77,4 @@ def exponent(costs: Mapping[int, float]) -> float:
     >>> round(exponent({1: 3.0, 10: 30.0, 100: 300.0}), 6)
     1.0
     """
-    sizes, values = zip(*costs.items(), strict=True)
-    return float(np.polyfit([math.log(each) for each in sizes], [math.log(each) for each in values], 1)[0])
+    return float(np.polyfit([math.log(size) for size in costs], [math.log(cost) for cost in costs.values()], 1)[0])

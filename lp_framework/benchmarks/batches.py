@@ -1,0 +1,152 @@
+"""Batches of pairs among few views, each view once, against two images a pair: loading, encoding, training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lp_framework.benchmarks.harness import Section, Work, worth
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.pairs import BlockSampler, PairBatch, PairData
+from lp_framework.models.pose_model import PoseModel
+from lp_framework.priors.base import Prior
+
+LOADING = "loader: a training step", ("pairs in feature space", "plain pair loader")
+ENCODING = "encoding: the images of pairs", ("each view once", "two images a pair")
+
+
+def measure_loading(section: Section, data: PairDataModule, new_model: PoseModel, rounds: int, steps: int) -> None:
+    """Training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
+    optimizer = _still(new_model.parameters())
+
+    def training(batches: Iterator[PairBatch]) -> Work:
+        def work() -> float:
+            done = 0
+            for _ in range(steps):
+                batch = next(batches)
+                optimizer.zero_grad()
+                loss_on(new_model, batch.to(section.device)).backward()
+                optimizer.step()
+                done += len(batch)
+            return done
+
+        return work
+
+    loaders = feature_space(data), plain_pairs(data.data("train"), data.batch_pairs)
+    section.note = _told(data, new_model)
+    kept = [kept_for_backward(new_model, next(batches).to(section.device)) for batches in loaders]  # and a warm-up
+    section.add("memory for backward, kB a pair", kept[0] / 1024, kept[1] / 1024)
+    works = {"pairs a second": (training(loaders[0]), training(loaders[1]))}
+    section.race(works, rounds, rate=True, warm_up=False)
+
+
+def measure_encoding(section: Section, data: PairDataModule, new_model: PoseModel, prior: Prior, rounds: int) -> None:
+    """Pairs a second through the model's backbone, through the prior's encoder, and in training on a frozen backbone.
+
+    The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
+    against features of both images of every pair at every step. Batches are drawn beforehand.
+    """
+    once, plain = next(feature_space(data)), next(plain_pairs(data.data("train"), data.batch_pairs))
+    optimizer = _still([*new_model.backbone.head.parameters(), *new_model.network.parameters()])
+
+    @torch.no_grad()
+    def encode(encoder: Callable[[Tensor], object], batch: PairBatch) -> None:
+        encoder(batch.to(section.device).images)
+
+    def train(batch: PairBatch, trunk: Callable[[], Tensor]) -> None:
+        optimizer.zero_grad()
+        loss_on(new_model, batch.to(section.device), new_model.backbone.head(trunk())).backward()
+        optimizer.step()
+
+    def both(do: Callable[..., None], *arguments: object) -> tuple[Work, Work]:
+        first, second = (worth(len(batch), partial(do, *arguments, batch)) for batch in (once, plain))
+        return first, second
+
+    def features(batch: PairBatch) -> Tensor:
+        return trunk_features(new_model, batch.to(section.device).images)
+
+    kept = features(once)
+    section.note = _told(data, new_model)
+    section.race(
+        {
+            "pairs a second, backbone": both(encode, new_model.encode),
+            "pairs a second, prior": both(encode, prior.encode),
+            "pairs a second, training on a frozen backbone": (
+                worth(len(once), lambda: train(once, lambda: kept)),
+                worth(len(plain), lambda: train(plain, lambda: features(plain))),
+            ),
+        },
+        rounds,
+        rate=True,
+    )
+
+
+def _still(parameters: object) -> torch.optim.Optimizer:
+    """An optimiser under which the weights stay, so that every step does the same work."""
+    return torch.optim.Adam(parameters, lr=0.0)  # type: ignore[arg-type]
+
+
+def _told(data: PairDataModule, model: PoseModel) -> str:
+    return f"images of {model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
+
+
+def feature_space(data: PairDataModule) -> Iterator[PairBatch]:
+    """Training batches without end, as the data module gives them."""
+    views = data.data("train")
+    sampler = BlockSampler(views.table, data.batch_pairs, data.block, seed=0)
+    while True:
+        for pairs in sampler:
+            yield views[pairs]
+
+
+def plain_pairs(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
+    """Pairs drawn at random, two images a pair, as a data set of image pairs gives them."""
+    everything = data.table.pairs()
+    random = np.random.default_rng(0)
+    while True:
+        yield two_images_a_pair(data[everything[random.choice(len(everything), batch_pairs, replace=False)]])
+
+
+def two_images_a_pair(batch: PairBatch) -> PairBatch:
+    """The batch with images of its own for every pair."""
+    views = torch.stack([batch.reference, batch.query], dim=-1).flatten()
+    own = {name: getattr(batch, name)[views] for name in ("pixels", "poses", "cameras", "objects")}
+    reference = 2 * torch.arange(len(batch))
+    return replace(batch, **own, names=[batch.names[view] for view in views], reference=reference, query=reference + 1)
+
+
+@torch.no_grad()
+def trunk_features(model: PoseModel, images: Tensor) -> Tensor:
+    """`[I, trunk_dim]` of images `[I, 3, H, W]`, without a graph, as of a frozen trunk."""
+    return model.backbone.trunk(images)
+
+
+def loss_on(model: PoseModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:
+    """The objective of a batch, of its images or of its views' features `[I, D]` where these are given."""
+    if features is None:
+        features = model.encode(batch.images)
+    true = batch.relative_poses()
+    condition = model.condition(features[batch.reference], features[batch.query])
+    return model.pair_loss(condition, torch.zeros_like(true), true).mean()
+
+
+def kept_for_backward(model: PoseModel, batch: PairBatch) -> float:
+    """Bytes a pair of the activations that a step keeps for its backward pass."""
+    storages: dict[int, int] = {}
+    parameters = {parameter.data_ptr() for parameter in model.parameters()}
+
+    def count(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in parameters:
+            storages[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+        loss = loss_on(model, batch)
+    loss.backward()
+    return sum(storages.values()) / len(batch)
