@@ -17,7 +17,7 @@ from result_folders import metrics, write_result
 from tiny_runs import Commands
 from view_folders import write_objects
 
-from lp_framework import load_prior
+from lp_framework import load_prior, registry
 from lp_framework.analysis.fields import (
     Draws,
     ExactModel,
@@ -37,9 +37,7 @@ from lp_framework.data.sets.rendered import MeshData
 from lp_framework.data.source import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.figures.cameras import CamerasFigure
-from lp_framework.figures.failures import FailuresFigure
-from lp_framework.figures.landscapes import LandscapesFigure
-from lp_framework.figures.trajectories import TrajectoriesFigure
+from lp_framework.figures.landscapes import FailuresFigure, LandscapesFigure, TrajectoriesFigure
 from lp_framework.geometry import apply_relative_pose, relative_pose
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.solvers.base import Pairs
@@ -140,7 +138,7 @@ def test_pairs_are_the_views_that_were_asked_for(data):
 
 def test_landscapes_say_how_many_minima_they_have(data):
     def gathered(prior):
-        return LandscapesFigure(data, prior, ["cup"], timesteps=[500]).analyse(0, CPU)[0].prior_energy
+        return LandscapesFigure(["cup"], data=data, prior=prior, timesteps=[500]).analyse(0, CPU)[0].prior_energy
 
     both, one = gathered(TWO_VALLEYS), gathered(ExactPrior())
     assert (minima_in_words(both), minima_in_words(one)) == ("2 minima", "1 minimum")
@@ -149,10 +147,11 @@ def test_landscapes_say_how_many_minima_they_have(data):
 
 
 def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
-    figure = TrajectoriesFigure(data, ExactPrior(), "cup", 1, 2, steps=40, views=3, timesteps=[500])
+    settings = {"data": data, "prior": ExactPrior(), "reference": 1, "query": 2, "timesteps": [500]}
+    figure = TrajectoriesFigure("cup", steps=40, views=3, **settings)
     pair, images = figure.analyse(0, CPU)
     trajectories = pair.trajectories
-    assert trajectories.shape == (4, 41, 3) and figure.steps == [0, 10, 40]
+    assert trajectories.shape == (4, 41, 3) and figure.shown_steps == [0, 10, 40]
     np.testing.assert_allclose(np.degrees(trajectories[:, 0, 1]) % 360, [0, 90, 180, 270], atol=1e-3)
     assert start_names(pair) == ["0°", "90°", "180°", "270°"]
     # An image of this prior holds its pose in the first three numbers: the views' are those of the trajectory.
@@ -160,7 +159,7 @@ def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
     pose = pairs.images[pairs.reference][0].flatten()[:3]
     for views, path in zip(images, trajectories, strict=True):
         generated = 2 * views.transpose(0, 3, 1, 2).reshape(3, -1)[:, :3] - 1
-        np.testing.assert_allclose(generated, np.clip(pose.numpy() + path[figure.steps], -1, 1), atol=1e-5)
+        np.testing.assert_allclose(generated, np.clip(pose.numpy() + path[figure.shown_steps], -1, 1), atol=1e-5)
 
 
 def test_generated_views_differ_by_their_poses_alone():
@@ -183,21 +182,16 @@ def test_a_camera_panel_has_every_camera():
     predicted = np.repeat(poses[1:, None], 2, axis=1) + 0.1
     wild = predicted.copy()
     wild[0, 1] = math.nan  # a start that failed
-    images = np.zeros((4, 8, 8, 3), np.uint8)
-    scene = CameraScene(
-        "cup", images, poses, math.radians(49), np.zeros((8, 8, 4), np.uint8), [predicted, wild], ["", ""]
-    )
+    images = [Image.new("RGBA", (8, 8))] * 4
+    scene = CameraScene("cup", images, poses, math.radians(49), [predicted, wild], ["", ""])
     figure = camera_methods_figure([scene, scene], ["one", "other"])
     counted = [
-        {
-            kind: [each for each in axes.collections if each.get_gid() == kind]
-            for kind in ("reference", "true", "predicted")
-        }
+        {kind: [each for each in axes.collections if each.get_gid() == kind] for kind in ("true", "predicted")}
         for axes in figure.axes
-        if any(each.get_gid() == "reference" for each in axes.collections)
+        if any(each.get_gid() == "true" for each in axes.collections)
     ]
     numbers = [tuple(len(each) for each in panel.values()) for panel in counted]
-    assert numbers == [(1, 3, 6), (1, 3, 5)] * 2
+    assert numbers == [(4, 6), (4, 5)] * 2
     bold, thin = (counted[0][kind][0].get_linewidth()[0] for kind in ("true", "predicted"))
     assert bold > 2 * thin
     assert colour_of(0) == RED and len({colour_of(index) for index in range(6)}) == 6
@@ -209,14 +203,14 @@ def test_predicted_cameras_stand_where_the_solver_says(data):
     assert [scene.title for scene in scenes] == ["cup", "tram"] and figure.named == ["iFusion"]
     places = [(0, 1), (0, 2), (0, 3)]  # there are no more
     pairs, shown = named_pairs(data, ["cup"] * 3 + ["tram"] * 3, places * 2, CPU)
-    solution = figure.solvers["ifusion"].solve(pairs, figure.starts.make(pairs, 0), 0)
+    solution = figure.solvers[0].solve(pairs, registry.build("start", {"name": "random", "count": 2}).make(pairs, 0), 0)
     references = torch.from_numpy(np.stack([pair.reference.pose for pair in shown]))
     cameras = apply_relative_pose(references[:, None], solution.poses.detach().double()).numpy()
     for number, scene in enumerate(scenes):
         np.testing.assert_allclose(scene.predicted[0], cameras[3 * number : 3 * number + 3], atol=1e-6)
         own = shown[3 * number : 3 * number + 3]
         np.testing.assert_allclose(scene.poses[1:], np.stack([pair.query.pose for pair in own]))
-        assert scene.images.shape == (4, 16, 16, 3) and scene.words[0].endswith("of 6 within 15°")
+        assert len(scene.images) == 4 and scene.words[0].endswith("of 6 within 15°")
 
 
 # ---------------------------------------------------------------- views from the mesh
@@ -242,9 +236,9 @@ def meshes(tmp_path_factory):
 
 
 def test_a_rendered_view_at_the_references_own_pose_is_the_reference(meshes):
-    figure = FailuresFigure(meshes, TWO_VALLEYS, ["box"], views=4, timesteps=[500])
+    figure = FailuresFigure(["box"], views=4, data=meshes, prior=TWO_VALLEYS, timesteps=[500])
     (row,) = figure.analyse(0, CPU)
-    assert {"0°", "90°", "180°", "270°"} <= {text.get_text() for text in figure.draw([row]).texts}
+    assert {"0°", "90°", "180°", "270°"} <= {text.get_text() for text in figure.draw([row])[0].texts}
     assert row.rendered is not None and row.rendered.shape == (4, 256, 256, 3) and len(row.generated) == 4
     small = row.rendered[0].reshape(64, 4, 64, 4, 3).mean(axis=(1, 3))
     assert np.abs(small - row.pair.reference.image / 255).mean() < 0.01
@@ -258,14 +252,15 @@ def test_a_rendered_view_at_the_references_own_pose_is_the_reference(meshes):
 
 
 def test_without_a_mesh_there_is_only_what_the_prior_generates(data):
-    (row,) = FailuresFigure(data, TWO_VALLEYS, ["vase"], views=3, timesteps=[500]).analyse(0, CPU)
+    figure = FailuresFigure(["vase"], views=3, data=data, prior=TWO_VALLEYS, timesteps=[500])
+    (row,) = figure.analyse(0, CPU)
     assert row.rendered is None
     view, views = View(Path("0.png"), np.zeros((8, 8, 3)), np.zeros(3)), np.zeros((3, 8, 8, 3))
     slope = Landscape(*landscape_grid(), 0.0, torch.linspace(0, 1, 480).view(16, 30))
     pair = ShownPair("vase", "continuous", "", view, view, np.zeros(3), landscapes={PRIOR_ENERGY: slope})
     row = FailureRow(pair, None, views)
-    bare = failures_figure([row], [0, 120, 240])
-    both = failures_figure([row._replace(rendered=views)], [0, 120, 240])
+    bare = failures_figure([row])
+    both = failures_figure([row._replace(rendered=views)])
     assert len(both.axes) == len(bare.axes) + 3
 
 
@@ -333,8 +328,6 @@ def test_the_command_writes_the_figure_and_its_caption(commands, name):
 
 
 def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
-    from lp_framework import registry
-
     root = Path(__file__).parents[1]
     assert sorted(SMALL) == registry.names("figure")
     described = (root / "docs" / "figures.md").read_text()
@@ -350,13 +343,16 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
             ["figure=toy"],
             "needs an energy model, and none ships: train one with `python -m lp_framework train model=en",
         ),
-        (["figure=toy", "figure.energy=score"], "figure.energy=score: holds a score model, an energy model is wanted"),
-        (["figure=cameras", "figure.score=energy"], "figure.score=energy: holds an energy model, a score model is wan"),
+        (["figure=toy", "figure.energy=score"], "figure.energy=score: holds no energy model"),
+        (["figure=cameras", "figure.score=energy"], "figure.score=energy: holds no score model"),
         (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data have no object 'cap'; did you mean"),
         (["figure=recall", "figure.runs=none"], "there is no such folder of finished runs; `python -m lp_framework ev"),
         (["figure=recall", "figure.runs=score"], "no finished runs with several numbers of starts; `python -m lp_fr"),
-        (["figure=landscapes", "figure.timesteps=[1000]"], "figure.timesteps must list some of 0 to 999"),
-        (["figure=landscapes", "figure.noises=0"], "figure.noises must be at least 1, got 0"),
+        (
+            ["figure=failures", "figure.objects=[cup]", "figure.timesteps=[1000]"],
+            "this prior has timesteps 0 to 999, got 1000",
+        ),
+        (["figure=landscapes", "figure.noises=0"], "noises must be a whole number, at least 1, got 0"),
         (["figure=landscapes", "figure.longitude_step_degrees=50"], "longitude_step_degrees must divide 360"),
         (["figure=landscapes", "figure.objects=[]"], "figure.objects needs the name of an object"),
         (["figure=trajectories", "figure.views=9"], "figure.views must be 2 to 5"),

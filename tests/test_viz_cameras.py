@@ -11,6 +11,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage, imread
 from numpy.typing import NDArray
+from PIL import Image
 from view_folders import draw_view, random_poses
 
 from lp_framework.geometry import camera_to_world, view_pose
@@ -20,11 +21,12 @@ from lp_framework.viz.cameras import (
     LARGEST,
     MOST_CARDS,
     OFFSETS,
-    Viewpoint,
+    Scene,
     best_viewpoint,
     cameras_figure,
     image_plane,
     shrunk,
+    viewpoint,
 )
 from lp_framework.viz.style import save_figure
 
@@ -32,13 +34,13 @@ HALF = math.radians(49.1) / 2
 
 
 def figure_of(poses: NDArray) -> Figure:
-    images = [draw_view(pose, 32) for pose in poses]
+    images = [Image.fromarray(draw_view(pose, 32)) for pose in poses]
     count = len(poses)
     return cameras_figure(poses, images, range(count), [f"{index}.png" for index in range(count)], 49.1)
 
 
 def test_the_projection_is_parallel_with_up_upwards():
-    view = Viewpoint(0.4, 0.7)
+    view = Scene(viewpoint(0.4, 0.7), np.zeros((1, 3)), 1.0, 1.0)
     towards = camera_to_world(torch.tensor([0.4, 0.7, 1.0], dtype=torch.float64))[:3, 3].numpy()
     np.testing.assert_allclose(view.project(towards), 0, atol=1e-12)
     assert view.nearness(towards) == pytest.approx(1) and view.nearness(-towards) == pytest.approx(-1)
@@ -60,19 +62,19 @@ def test_an_image_plane_is_what_the_camera_sees_there():
 
 def test_the_viewpoint_keeps_cameras_apart():
     # From straight behind the first, the second would be hidden by it.
-    behind = Viewpoint(math.radians(ELEVATION), 1.0)
+    behind = viewpoint(math.radians(ELEVATION), 1.0)
     first = torch.tensor([math.radians(10), 1.0, 1.4], dtype=torch.float64)
     camera = torch.eye(4, dtype=torch.float64)
-    camera[:3, 3] = camera_to_world(first)[:3, 3] - 2 * torch.from_numpy(behind.axes[:, 2])
+    camera[:3, 3] = camera_to_world(first)[:3, 3] - 2 * torch.from_numpy(behind[:, 2])
     poses = torch.stack([first, view_pose(camera)]).numpy()
     centres = camera_to_world(torch.from_numpy(poses))[:, :3, 3].numpy()
 
-    def apart(view: Viewpoint) -> float:
-        return float(np.linalg.norm(np.diff(view.project(centres), axis=0)))
+    def apart(view: NDArray) -> float:
+        return float(np.linalg.norm(np.diff(centres @ view[:, :2], axis=0)))
 
     best = best_viewpoint(poses)
     assert apart(behind) < 1e-9 and apart(best) > 0.5
-    towards = best.axes[:, 2]
+    towards = best[:, 2]
     offset = math.degrees(math.atan2(towards[0], towards[2]) - 1.0)
     assert min(OFFSETS) - 1e-6 <= offset <= max(OFFSETS) + 1e-6
     assert math.degrees(math.asin(towards[1])) == pytest.approx(ELEVATION)
@@ -89,10 +91,10 @@ def test_images_lie_in_their_planes():
     for image, plane in zip(scene.images, planes, strict=True):
         to_data = image.get_transform() - scene.transData
         corners = to_data.transform(np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
-        np.testing.assert_allclose(corners, view.project(plane), atol=1e-9)
+        np.testing.assert_allclose(corners, plane @ view[:, :2], atol=1e-9)
         assert image.get_extent() == [0, 1, 0, 1] and image.origin == "upper"  # its top row at the plane's top
     limits = np.array([scene.get_xlim(), scene.get_ylim()]).T
-    drawn = view.project(np.concatenate([*planes, matrices[:, :3, 3]]))
+    drawn = np.concatenate([*planes, matrices[:, :3, 3]]) @ view[:, :2]
     assert (drawn > limits[0]).all() and (drawn < limits[1]).all()
     assert scene.get_aspect() == 1
 
@@ -105,23 +107,23 @@ def test_nearer_cameras_hide_farther_ones():
 
 
 def test_an_image_seen_edge_on_is_left_out(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(cameras, "best_viewpoint", lambda poses: Viewpoint(0.0, math.pi / 2))
+    monkeypatch.setattr(cameras, "best_viewpoint", lambda poses: viewpoint(0.0, math.pi / 2))
     poses = np.array([[0.0, 0.0, 1.4], [0.0, 1.0, 1.4]])
     figure = figure_of(poses)
     (image,) = figure.axes[0].images  # the second camera's; the first's, and the cut-out, are lines from here
-    np.testing.assert_array_equal(image.get_array(), shrunk(draw_view(poses[1], 32)))
+    np.testing.assert_array_equal(image.get_array(), draw_view(poses[1], 32))
     figure.canvas.draw()
 
 
 def test_small_images_keep_colours_and_opacity():
-    image = np.zeros((2 * LARGEST + 1, 2 * LARGEST + 1, 4), dtype=np.uint8)
+    image = np.zeros((4 * LARGEST, 4 * LARGEST, 4), dtype=np.uint8)
     image[::2, ::2] = [200, 100, 50, 255]  # every fourth pixel, the others transparent black
-    small = shrunk(image)
+    small = np.asarray(shrunk(Image.fromarray(image)))
     assert small.shape == (LARGEST, LARGEST, 4)
-    assert (small == [200, 100, 50, 64]).all()
+    inside = small[1:-1, 1:-1].astype(int)  # on the border a filter has fewer pixels
+    assert np.abs(inside - [200, 100, 50, 64]).max() <= 2
     whole = draw_view(np.array([0.1, 0.2, 1.4]), 16)
-    visible = whole[..., 3] > 0
-    np.testing.assert_array_equal(shrunk(whole)[visible], whole[visible])
+    np.testing.assert_array_equal(np.asarray(shrunk(Image.fromarray(whole))), whole)
 
 
 @pytest.mark.parametrize("count", [1, 2, 8, 15])
@@ -130,17 +132,17 @@ def test_every_camera_is_numbered_and_has_a_card(count: int, tmp_path: Path):
     figure = figure_of(poses)
     scene, *cards = figure.axes
     shown = min(count, MOST_CARDS)
-    assert len(cards) == 2 * shown
+    assert len(cards) == shown
     numbers = [text.get_text() for text in scene.texts if not text.get_text().endswith("°")]
     assert sorted(numbers, key=int) == [str(index) for index in range(count)]
-    for index, (card, text) in enumerate(zip(cards[::2], cards[1::2], strict=True)):
-        assert isinstance(card.images[0], AxesImage)
-        lines = [each.get_text() for each in text.texts]
+    assert all(isinstance(card.images[0], AxesImage) for card in cards)
+    written = [text.get_text() for text in figure.texts[2:]]
+    for index in range(shown):
         latitude, longitude, radius = np.rad2deg(poses[index, 0]), np.rad2deg(poses[index, 1]), poses[index, 2]
         sign = "\N{MINUS SIGN}" if latitude < 0 else ""
-        assert lines == [
-            str(index), f"{index}.png", f"latitude {sign}{abs(latitude):.1f}°", f"longitude {longitude:.1f}°",
-            f"radius {radius:.2f}",
+        assert written[3 * index : 3 * index + 3] == [
+            str(index), f"{index}.png",
+            f"latitude {sign}{abs(latitude):.1f}°\nlongitude {longitude:.1f}°\nradius {radius:.2f}",
         ]  # fmt: skip
     note = figure.texts[1].get_text()
     assert note == "0 is the reference" + ("; below, 12 of 15 images" if count == 15 else "")

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lp_framework.analysis.landscapes import Arrows, Grid, Landscape, cell_grid
+from lp_framework.errors import UserError
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.models.pose_model import FieldValue, PoseModel
 from lp_framework.priors.base import Prior
@@ -43,6 +44,17 @@ class Draws(NamedTuple):
         each = "one noise" if self.noises == 1 else f"{self.noises} noises"
         steps = ", ".join(map(str, self.timesteps))
         return f"Mean over both directions of the pair, timesteps {steps} and {each} at each."
+
+
+def checked_draws(timesteps: object, noises: object, seed: int, batch: object = 64) -> Draws:
+    """Draws by settings; `UserError` for those that are none. Which timesteps there are a prior says itself."""
+    for key, value in (("noises", noises), ("batch", batch)):
+        if not isinstance(value, int) or value < 1:
+            raise UserError(f"{key} must be a whole number, at least 1, got {value}")
+    steps = list(timesteps) if isinstance(timesteps, Sequence) else []
+    if not steps or not all(isinstance(each, int) for each in steps):
+        raise UserError(f"timesteps must list whole numbers, one at least, got {timesteps}")
+    return Draws(steps, noises, seed, batch)  # type: ignore[arg-type]  # both are whole numbers
 
 
 class ExactModel(nn.Module):

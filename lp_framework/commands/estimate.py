@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from PIL import Image
@@ -159,9 +158,9 @@ def _write(folder: Path, views: Sequence[View], prepared: Sequence[Image.Image],
         write_text(folder / "colmap" / name, text)
     write_csv(folder / "poses.csv", COLUMNS, [view.row() for view in views])
     write_json(folder / "results.json", result)
-    pixels = [np.asarray(prepared[number]) for number in numbers]
+    images = [prepared[number] for number in numbers]
     titles = [views[number].file.name for number in numbers]
-    save_figure(cameras_figure(poses.numpy(), pixels, numbers, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
+    save_figure(cameras_figure(poses.numpy(), images, numbers, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
 
 
 def _print(folder: Path, views: Sequence[View]) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from omegaconf import DictConfig
 from rich.console import Console
 
@@ -11,6 +9,7 @@ from lp_framework.commands.building import Components, orderly_console, plain, r
 from lp_framework.commands.device import choose_device
 from lp_framework.evaluation.tables import write_json
 from lp_framework.figures.base import PaperFigure
+from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.style import save_figure
 
 
@@ -22,22 +21,23 @@ def run(config: DictConfig) -> None:
     device = choose_device(config.accelerator)
     name = config.figure.name
     components = Components(plain(config))
-    figure: PaperFigure[Any] = components["figure"]
+    figure: PaperFigure = components["figure"]
     if "data" in components.needs("figure"):
         components["data"].evaluate_on("ordered", config.seed)  # only the test views
         components["data"].prepare_data()
     for part in figure.networks():
         part.to(device)
-    contents = figure.analyse(config.seed, device)
-    files = save_figure(figure.draw(contents), folder / f"figure_{name}")
+    with shown_progress():
+        drawn, caption = figure.draw(figure.analyse(config.seed, device))
+    files = save_figure(drawn, folder / f"figure_{name}")
     record = {
         "files": [file.name for file in files],
-        "caption": figure.caption(contents),
+        "caption": caption,
         "seed": config.seed,
         "config": plain(config),
         "versions": versions(),
     }
     write_json(folder / "figure.json", record)
     console = Console(soft_wrap=True, highlight=False)
-    console.print(f"caption: {record['caption']}", markup=False)
+    console.print(f"caption: {caption}", markup=False)
     console.print(f"picture: {files[0]}, {files[1].name}", markup=False)

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Generic, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from matplotlib.figure import Figure
 from torch import nn
 
-from lp_framework.analysis.fields import Draws
+from lp_framework.analysis.fields import checked_draws
+from lp_framework.analysis.pairs import named_pairs
+from lp_framework.analysis.shown import ShownPair
+from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs
 
-Contents = TypeVar("Contents")
 
-
-class PaperFigure(ABC, Generic[Contents]):
+class PaperFigure(ABC):
     """A figure. A subclass's constructor declares what it needs by name (`data`, `prior`) and has its settings."""
 
     def networks(self) -> list[nn.Module]:
@@ -27,43 +30,44 @@ class PaperFigure(ABC, Generic[Contents]):
         return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     @abstractmethod
-    def analyse(self, seed: int, device: torch.device) -> Contents:
+    def analyse(self, seed: int, device: torch.device) -> Any:
         """The arrays of the figure; the data are prepared, the networks are on the device. Draws follow `seed`."""
 
     @abstractmethod
-    def draw(self, contents: Contents) -> Figure:
-        """The figure of what was found."""
-
-    @abstractmethod
-    def caption(self, contents: Contents) -> str:
-        """What to print below the figure: its panels, and the settings that its numbers depend on."""
+    def draw(self, contents: Any) -> tuple[Figure, str]:
+        """The figure of what was found, and a caption: its panels, and the settings that its numbers depend on."""
 
 
-def checked_draws(prior: Prior, timesteps: Sequence[int], noises: int) -> Draws:
-    """The draws of a figure; `UserError` unless the prior has all of the timesteps, and there is one noise at least."""
-    if not timesteps or not all(0 <= each < prior.num_timesteps for each in timesteps):
-        raise UserError(
-            f"figure.timesteps must list some of 0 to {prior.num_timesteps - 1}, which this prior has; "
-            f"got {list(timesteps)}"
-        )
-    if noises < 1:
-        raise UserError(f"figure.noises must be at least 1, got {noises}")
-    return Draws(list(timesteps), noises, seed=0)
+@dataclass(kw_only=True)
+class PairsFigure(PaperFigure):
+    """A figure of pairs: of each object two test views, by number."""
+
+    data: PairDataModule
+    reference: int = 0
+    query: int = 1
+
+    def pairs(self, objects: Sequence[str], device: torch.device) -> tuple[Pairs, list[ShownPair]]:
+        """See `named_pairs`; `UserError` for no objects."""
+        if not objects:
+            raise UserError("figure.objects needs the name of an object")
+        return named_pairs(self.data, objects, [(self.reference, self.query)] * len(objects), device)
 
 
-def checked_objects(objects: Sequence[str]) -> list[str]:
-    """The names of objects; `UserError` for none."""
-    if not objects:
-        raise UserError("figure.objects needs the name of an object")
-    return list(objects)
+@dataclass(kw_only=True)
+class EnergyFigure(PairsFigure):
+    """A figure of pairs and the prior's energy, which is the mean over `timesteps`, `noises` each."""
+
+    prior: Prior
+    timesteps: Sequence[int] = (100, 300, 500, 700, 900)
+    noises: int = 1
+
+    def __post_init__(self) -> None:
+        self.draws = checked_draws(self.timesteps, self.noises, seed=0)
 
 
 def score_model(path: str | None) -> PoseModel:
     """The score model of a training run or checkpoint; None: the one that ships."""
-    model = load_model(SHIPPED / "score" if path is None else path)
-    if model.has_energy:
-        raise UserError(f"figure.score={path}: holds an energy model, a score model is wanted")
-    return model
+    return _checked(load_model(SHIPPED / "score" if path is None else path), "score", path)
 
 
 def energy_model(path: str | None) -> PoseModel:
@@ -73,7 +77,10 @@ def energy_model(path: str | None) -> PoseModel:
             "this figure needs an energy model, and none ships: train one with `python -m lp_framework train "
             "model=energy hydra.run.dir=runs/energy`, then add figure.energy=runs/energy"
         )
-    model = load_model(path)
-    if not model.has_energy:
-        raise UserError(f"figure.energy={path}: holds a score model, an energy model is wanted")
+    return _checked(load_model(path), "energy", path)
+
+
+def _checked(model: PoseModel, wanted: str, path: str | None) -> PoseModel:
+    if model.has_energy != (wanted == "energy"):
+        raise UserError(f"figure.{wanted}={path}: holds no {wanted} model")
     return model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -18,15 +19,16 @@ EXPERIMENT, COUNT = "starts", "start.count"
 
 
 @register("figure", "recall")
-class RecallFigure(PaperFigure[SweepTable]):
+@dataclass
+class RecallFigure(PaperFigure):
     """Recall within 30 degrees against the number of random starts and against time, a curve a solver.
 
     `runs` is a folder with finished jobs of `eval experiment=starts`; `objects` says whether all objects count, or
     only those with a unique answer.
     """
 
-    def __init__(self, runs: str = "runs/multirun/eval/starts", objects: Objects = "unique_answer") -> None:
-        self.runs, self.objects = runs, objects
+    runs: str = "runs/multirun/eval/starts"
+    objects: Objects = "unique_answer"
 
     def analyse(self, seed: int, device: torch.device) -> SweepTable:
         """The table of the experiment; nothing is drawn at random."""
@@ -41,17 +43,13 @@ class RecallFigure(PaperFigure[SweepTable]):
             raise UserError(f"figure.runs={self.runs}: {reason}")
         return table
 
-    def draw(self, contents: SweepTable) -> Figure:
-        """See `report.sweep_figures`."""
+    def draw(self, contents: SweepTable) -> tuple[Figure, str]:
+        """See `PaperFigure`."""
         figure = sweep_figure(contents)
         assert figure is not None  # the number of starts varies
-        return figure
-
-    def caption(self, contents: SweepTable) -> str:
-        """See `PaperFigure`."""
         seeds = max(len(row.seeds) for row in contents.rows)
         over = "objects with a unique answer" if self.objects == "unique_answer" else "all objects"
-        return (
+        return figure, (
             "Recall within 30 degrees (and a translation error of 0.2) for different numbers of random starts, and for "
             f"the seconds that they take, over {over}; bars: standard deviation over {seeds} seeds."
         )

@@ -15,55 +15,38 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.distance import pdist
 
+from lp_framework.data.photographs import on_white
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz import style
 from lp_framework.viz.style import ASIDE, BLUE, FAINT, INK, MUTED, VERMILION, Sheet, letter, shortened, styled
 
 ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the second relative to the reference
 NEAR_BY = 0.34  # how far from a camera its image is drawn, as a share of the largest radius
-OBJECT_CHARGE = 4.0  # how much the object keeps cameras off in the picture
 LARGEST = 128  # pixels a side of an image in the scene, but for the one in the middle
 SIDE = 0.1  # inches: the margin
 
 # ---------------------------------------------------------------- the scene
 
 
-class Viewpoint:
-    """A parallel projection of the scene, from far away at a latitude and longitude (radians)."""
-
-    def __init__(self, latitude: float, longitude: float) -> None:
-        pose = torch.tensor([latitude, longitude, 1.0], dtype=torch.float64)
-        self.axes = camera_to_world(pose)[:3, :3].numpy()  # columns: right, up, towards us
-
-    def project(self, points: NDArray) -> NDArray:
-        """Where points `[..., 3]` appear, `[..., 2]` (right, up; scene units)."""
-        return points @ self.axes[:, :2]
-
-    def nearness(self, points: NDArray) -> NDArray:
-        """How near points `[..., 3]` are to us, `[...]`."""
-        return points @ self.axes[:, 2]
+def viewpoint(latitude: float, longitude: float) -> NDArray:
+    """Axes `[3, 3]` of a parallel projection from far away (radians): columns to the right, up, and towards us."""
+    axes: NDArray = camera_to_world(torch.tensor([latitude, longitude, 1.0], dtype=torch.float64))[:3, :3].numpy()
+    return axes
 
 
-def best_viewpoint(poses: NDArray) -> Viewpoint:
+def best_viewpoint(poses: NDArray) -> NDArray:
     """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart.
 
-    That is where charges, one at each camera, one where its image is drawn, and a larger one at the object, would have
-    least energy.
+    That is where equal charges, at each camera, where its image is drawn, and at the object, would have least energy.
     """
     centres = _cameras(poses)[:, :3, 3]
     points = np.concatenate([np.zeros((1, 3)), centres, centres * (1 - NEAR_BY)])
-    charges = np.array([OBJECT_CHARGE] + [1.0] * (len(points) - 1))
-
-    def energy(viewpoint: Viewpoint) -> float:
-        seen = viewpoint.project(points)
-        squares = np.square(seen[:, None] - seen).sum(axis=-1) + 1e-6
-        np.fill_diagonal(squares, np.inf)
-        return round(float((charges[:, None] * charges / squares).sum()), 6)
-
     elevation = math.radians(ELEVATION)
-    viewpoints = [Viewpoint(elevation, poses[0, 1] + math.radians(offset)) for offset in OFFSETS]
-    return min(viewpoints, key=energy)
+    viewpoints = [viewpoint(elevation, poses[0, 1] + math.radians(offset)) for offset in OFFSETS]
+    return min(viewpoints, key=lambda axes: np.sum(1 / (pdist(points @ axes[:, :2], "sqeuclidean") + 1e-6)).round(6))
 
 
 def image_plane(camera: NDArray, distance: float, half_angle: float) -> NDArray:
@@ -94,10 +77,18 @@ ROUND, SPOKES = _circle(range(0, 361, 2)), _circle(range(0, 360, 30))
 class Scene:
     """What is seen of points `[K, 3]` from a viewpoint, and the ground, the plane of latitude 0, out to `radius`."""
 
-    def __init__(self, view: Viewpoint, points: NDArray, radius: float, margin: float) -> None:
+    def __init__(self, view: NDArray, points: NDArray, radius: float, margin: float) -> None:
         self.view, self.radius = view, radius
-        seen = view.project(np.concatenate([points, margin * radius * ROUND]))
+        seen = self.project(np.concatenate([points, margin * radius * ROUND]))
         self.low, self.high = seen.min(axis=0) - 0.06 * radius, seen.max(axis=0) + 0.06 * radius
+
+    def project(self, points: NDArray) -> NDArray:
+        """Where points `[..., 3]` appear, `[..., 2]` (right, up; scene units)."""
+        return points @ self.view[:, :2]
+
+    def nearness(self, points: NDArray) -> NDArray:
+        """How near points `[..., 3]` are to us, `[...]`, in units of the radius."""
+        return points @ self.view[:, 2] / self.radius
 
     def height(self, wide: float) -> float:
         """The height of axes that show it and are so wide."""
@@ -109,15 +100,15 @@ class Scene:
         self.axes = axes
         axes.set(xlim=(self.low[0], self.high[0]), ylim=(self.low[1], self.high[1]), aspect="equal")
         axes.axis("off")
-        rings = [self.view.project(share * self.radius * ROUND) for share in (1, 0.5)]
-        axes.add_patch(Polygon(rings[0], facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
-        axes.add_patch(Polygon(rings[1], fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
-        spokes = [[(0, 0), end] for end in self.view.project(self.radius * SPOKES)]
+        outer, inner = (self.project(share * self.radius * ROUND) for share in (1, 0.5))
+        axes.add_patch(Polygon(outer, facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
+        axes.add_patch(Polygon(inner, fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
+        spokes = [[(0, 0), end] for end in self.project(self.radius * SPOKES)]
         axes.add_collection(LineCollection(spokes, colors=FAINT, linewidths=0.4, zorder=1.1))
 
-    def image(self, image: NDArray, plane: NDArray, order: float) -> None:
+    def image(self, image: Image.Image, plane: NDArray, order: float) -> None:
         """An image in its plane (as `image_plane`); nothing where that is seen edge-on."""
-        corners = self.view.project(plane)
+        corners = self.project(plane)
         right, up = corners[1] - corners[0], corners[3] - corners[0]
         if abs(right[0] * up[1] - right[1] * up[0]) < 1e-3 * (right @ right + up @ up):
             return
@@ -126,20 +117,16 @@ class Scene:
 
     def frustum(self, centre: NDArray, plane: NDArray, **line: Any) -> None:
         """The edges of a camera's pyramid, from its centre to its image's plane."""
-        apex, corners = self.view.project(centre), self.view.project(plane)
+        apex, corners = self.project(centre), self.project(plane)
         edges = [np.stack([apex, corner]) for corner in corners] + [np.concatenate([corners, corners[:1]])]
         self.axes.add_collection(LineCollection(edges, capstyle="round", joinstyle="round", **line))
 
 
-def shrunk(image: NDArray) -> NDArray:
-    """The image `[S, S, 4]` with about `LARGEST` pixels a side, or as it is; colours are weighted by opacity."""
-    step = max(1, len(image) // LARGEST)
-    size = len(image) // step
-    cells = image[: size * step, : size * step].astype(float).reshape(size, step, size, step, 4)
-    alpha = cells[..., 3:]
-    opacity = alpha.sum(axis=(1, 3))
-    colours = (cells[..., :3] * alpha).sum(axis=(1, 3)) / np.maximum(opacity, 1)
-    return np.rint(np.concatenate([colours, opacity / step**2], axis=-1)).astype(np.uint8)
+def shrunk(image: Image.Image) -> Image.Image:
+    """The image with at most `LARGEST` pixels a side; colours are weighted by opacity."""
+    small = image.copy()
+    small.thumbnail((LARGEST, LARGEST))
+    return small
 
 
 # ---------------------------------------------------------------- the cameras of photographs
@@ -152,12 +139,12 @@ WIDTH, TOP, TALLEST, TEXT, GAP = 8.0, 0.3, 4.6, 0.66, 0.12
 @styled
 def cameras_figure(
     poses: NDArray,
-    images: Sequence[NDArray],
+    images: Sequence[Image.Image],
     numbers: Sequence[int],
     titles: Sequence[str],
     field_of_view_degrees: float,
 ) -> Figure:
-    """Cameras at view poses `[V, 3]` around the object, each with an image `[S, S, 4]` (RGBA, uint8), number and title.
+    """Cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title.
 
     The first is the reference; its image also stands for the object, as a cut-out in the middle. Below the scene are
     the images (the first `MOST_CARDS`) with their poses.
@@ -168,6 +155,7 @@ def cameras_figure(
     planes = [image_plane(camera, distance, half_angle) for camera in cameras]
     points = np.concatenate([middle, *planes, cameras[:, :3, 3]])
     scene = Scene(best_viewpoint(poses), points, furthest, margin=1.14)
+    colours = [BLUE, *[VERMILION] * (len(poses) - 1)]
     tall, cards = min(TALLEST, scene.height(WIDTH)), min(len(images), MOST_CARDS)
     side = (WIDTH - 2 * SIDE - GAP * (CARD_COLUMNS - 1)) / CARD_COLUMNS
     rows = math.ceil(cards / CARD_COLUMNS)
@@ -178,59 +166,44 @@ def cameras_figure(
     more = f"; below, {cards} of {len(images)} images" if len(images) > cards else ""
     sheet.text(WIDTH - SIDE, 0.12, f"{numbers[0]} is the reference{more}", va="top", ha="right", **ASIDE)
     scene.begin(sheet.axes(0, TOP, WIDTH, tall))
-    for place, (x, y) in enumerate(scene.view.project(1.09 * furthest * SPOKES[::3])):
+    for place, (x, y) in enumerate(scene.project(1.09 * furthest * SPOKES[::3])):
         scene.axes.text(x, y, f"{90 * place}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
     scene.image(images[0], middle, order=100.0)
-    for index, (camera, plane) in enumerate(zip(cameras, planes, strict=True)):
-        _draw_camera(scene, camera[:3, 3], plane, shrunk(images[index]), _colour(index))
-        _write_number(scene.axes, scene.view.project(camera[:3, 3]), numbers[index], 200.0, _colour(index))
+    for camera, plane, image, number, colour in zip(cameras, planes, images, numbers, colours, strict=True):
+        _draw_camera(scene, camera[:3, 3], plane, shrunk(image), colour)
+        x, y = scene.project(camera[:3, 3])
+        scene.axes.text(x, y, str(number), zorder=200.0, **_badge(colour))
 
     for index in range(cards):
         row, column = divmod(index, columns)
         x = (WIDTH - columns * (side + GAP) + GAP) / 2 + column * (side + GAP)
         y = TOP + tall + row * (side + TEXT)
-        alpha = images[index][..., 3:] / 255
-        on_white = np.rint(images[index][..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-        sheet.image(x, y, side, on_white, color=_colour(index), linewidth=1.0)
-        below = sheet.axes(x, y + side, side, TEXT)
-        below.set(xlim=(0, side), ylim=(TEXT, 0))  # one data unit is an inch
-        below.axis("off")
-        _write_number(below, np.array([0.08, 0.1]), numbers[index], 3.0, _colour(index))
-        _write_card(below, shortened(titles[index], 14 * side - 3), poses[index])
+        sheet.image(x, y, side, on_white(images[index]), color=colours[index], linewidth=1.0)
+        sheet.text(x + 0.08, y + side + 0.1, str(numbers[index]), **_badge(colours[index]))
+        name = shortened(titles[index], 14 * side - 3)
+        sheet.text(x + 0.2, y + side + 0.1, name, fontsize=7.5, fontweight="bold", va="center_baseline")
+        latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
+        pose = f"latitude {latitude:.1f}°\nlongitude {longitude:.1f}°\nradius {poses[index, 2]:.2f}"
+        sheet.text(x, y + side + 0.2, pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, va="top")
     return sheet.figure
 
 
-def _colour(index: int) -> str:
-    return BLUE if index == 0 else VERMILION
-
-
-def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: NDArray, colour: str) -> None:
+def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: Image.Image, colour: str) -> None:
     """A pyramid from the camera's centre to its image, its line of sight, and its height above the ground."""
-    order = 100.0 + 10 * float(scene.view.nearness(centre)) / scene.radius
-    height, sight = (scene.view.project(np.stack([centre, end])).T for end in (centre * [1, 0, 1], 0 * centre))
+    order = 100.0 + 10 * float(scene.nearness(centre))
+    height, sight = (scene.project(np.stack([centre, end])).T for end in (centre * [1, 0, 1], 0 * centre))
     scene.axes.plot(*height, color=MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
     scene.axes.plot(*sight, color=colour, linewidth=0.7, linestyle=(0, (2, 3)), zorder=3)
-    corners = scene.view.project(plane)
+    corners = scene.project(plane)
     scene.axes.add_patch(Polygon(corners, facecolor="white", edgecolor="none", alpha=0.65, zorder=order))
     scene.image(image, plane, order + 0.1)
     scene.frustum(centre, plane, colors=colour, linewidths=[0.7] * 4 + [1.0], zorder=order + 0.2)
 
 
-def _write_number(axes: Axes, place: NDArray, number: int, order: float, colour: str) -> None:
-    axes.annotate(
-        str(number), tuple(place), color="white", fontsize=6.5, fontweight="bold", ha="center", va="center",
-        zorder=order, annotation_clip=False,
-        bbox={"boxstyle": "circle,pad=0.25", "facecolor": colour, "edgecolor": "white", "linewidth": 0.8},
-    )  # fmt: skip
-
-
-def _write_card(axes: Axes, title: str, pose: NDArray) -> None:
-    """Name and pose below an image."""
-    axes.text(0.2, 0.1, title, fontsize=7.5, fontweight="bold", va="center_baseline")
-    latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in pose[:2])  # + 0.0: no minus zero
-    lines = (f"latitude {latitude:.1f}°", f"longitude {longitude:.1f}°", f"radius {pose[2]:.2f}")
-    for line, text in enumerate(lines):
-        axes.text(0, 0.25 + 0.125 * line, text.replace("-", "\N{MINUS SIGN}"), fontsize=7, va="center_baseline")
+def _badge(colour: str) -> dict[str, Any]:
+    """The style of a number on a disk."""
+    disk = {"boxstyle": "circle,pad=0.25", "facecolor": colour, "edgecolor": "white", "linewidth": 0.8}
+    return {"color": "white", "fontsize": 6.5, "fontweight": "bold", "ha": "center", "va": "center", "bbox": disk}
 
 
 # ---------------------------------------------------------------- the cameras that methods predict
@@ -248,16 +221,15 @@ IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
 
 
 class CameraScene(NamedTuple):
-    """One object: images `[V, H, W, 3]` (uint8) and view poses `[V, 3]`, of which the first is the reference's, and
-    their field of view (radians); its cut-out `[S, S, 4]` (RGBA, uint8); and of each method the predicted view poses
-    `[V - 1, N, 3]` of the others from N starts, with a word on how good they are.
+    """One object: images (RGBA) and view poses `[V, 3]`, of which the first is the reference's, and
+    their field of view (radians); and of each method the predicted view poses `[V - 1, N, 3]` of the others from N
+    starts, with a word on how good they are.
     """
 
     title: str
-    images: NDArray
+    images: Sequence[Image.Image]
     poses: NDArray
     field_of_view: float
-    cutout: NDArray
     predicted: Sequence[NDArray]
     words: Sequence[str]
 
@@ -279,7 +251,7 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
         for index, image in enumerate(each.images):
             line, column = divmod(index, IMAGE_COLUMNS)
             x, y = SIDE + column * (IMAGE + BETWEEN), top + (tall - images) / 2 + line * (IMAGE + BETWEEN)
-            sheet.image(x, y, IMAGE, image, color=colour_of(index), linewidth=1.4)
+            sheet.image(x, y, IMAGE, on_white(image), color=colour_of(index), linewidth=1.4)
         for number, (poses, word) in enumerate(zip(each.predicted, each.words, strict=True)):
             x = SIDE + IMAGES + APART + number * (wide + APART)
             scene.begin(sheet.axes(x, top, wide, tall))
@@ -300,19 +272,17 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
 
 
 def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray) -> None:
-    """The cut-out in the middle, the true cameras and those predicted, `[V - 1, N, 3]`."""
+    """The reference's cut-out in the middle, the true cameras and those predicted, `[V - 1, N, 3]`."""
     cameras, half_angle = _cameras(content.poses), content.field_of_view / 2
-    scene.image(shrunk(content.cutout), image_plane(cameras[0], float(content.poses[0, 2]), half_angle), order=10.0)
-
-    def draw(camera: NDArray, kind: str, index: int, order: float, **line: Any) -> None:
+    middle = image_plane(cameras[0], float(content.poses[0, 2]), half_angle)
+    scene.image(shrunk(content.images[0]), middle, order=10.0)
+    drawn = [("true", index, camera, TRUE) for index, camera in enumerate(cameras)]
+    drawn += [("predicted", index, camera, PREDICTED) for index, poses in enumerate(predicted, 1)
+              for camera in _cameras(poses)]  # fmt: skip
+    for kind, index, camera, line in drawn:
         plane = image_plane(camera, FRUSTUM * scene.radius, half_angle)
+        order = 20.0 + float(scene.nearness(camera[:3, 3])) if kind == "true" else 30.0
         scene.frustum(camera[:3, 3], plane, color=colour_of(index), zorder=order, gid=kind, **line)
-
-    for index, camera in enumerate(cameras):
-        draw(camera, "true" if index else "reference", index, 20.0 + float(scene.view.nearness(camera[:3, 3])), **TRUE)
-    for index, poses in enumerate(predicted):
-        for camera in _cameras(poses):
-            draw(camera, "predicted", index + 1, 30.0, **PREDICTED)
 
 
 def colour_of(index: int) -> str:

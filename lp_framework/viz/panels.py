@@ -93,13 +93,14 @@ class FailureRow(NamedTuple):
 
 
 @styled
-def failures_figure(rows: Sequence[FailureRow], longitudes_degrees: Sequence[float]) -> Figure:
-    """A row a pair: reference above query, views at relative longitudes, rendered above generated, the landscape."""
+def failures_figure(rows: Sequence[FailureRow]) -> Figure:
+    """A row a pair: reference above query, views evenly around, rendered above generated, the landscape."""
+    longitudes = [360 * place / len(rows[0].generated) for place in range(len(rows[0].generated))]
     image, wide = 0.7, 1.72
     block = 2 * image + GAP
     sheet = Sheet(WIDTH, TITLE + len(rows) * (block + TITLE) + 0.3)
     left, right = SIDE + image + 0.42, WIDTH - SIDE - wide
-    view = min(image, (right - 0.55 - left + GAP) / len(longitudes_degrees) - GAP)
+    view = min(image, (right - 0.55 - left + GAP) / len(longitudes) - GAP)
     for x, title in ((SIDE, "(a) pair"), (left, "(b) turned around the object"), (right, "(c) landscape")):
         sheet.above(x, TITLE, title)
     for number, (pair, *swept) in enumerate(rows):
@@ -114,7 +115,7 @@ def failures_figure(rows: Sequence[FailureRow], longitudes_degrees: Sequence[flo
             sheet.text(left - 0.08, y + view / 2, name, fontsize=7.5, rotation=90, ha="right", va="center")
             for column, picture in enumerate(views):
                 sheet.image(left + column * (view + GAP), y, view, picture)
-        for column, longitude in enumerate(longitudes_degrees):
+        for column, longitude in enumerate(longitudes):
             sheet.above(left + column * (view + GAP) + view / 2, top, f"{longitude:g}°", ha="center", **SMALL)
         axes = sheet.axes(right, upper, wide, block - 0.1)
         draw_map(axes, PoseMap(relief=pair.prior_energy), pair.truth, small=True)
