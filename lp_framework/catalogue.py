@@ -1,16 +1,16 @@
 """What can be chosen and set: the YAML files of the conf folders, and the signatures of plugins that bring none.
 
 `conf/GROUP/CHOICE.yaml` holds all settings of a choice with a comment each; its first comment says what the choice is.
-Only YAML is read here, so that listings and `--help` answer at once.
+Only text is read here, so that listings and `--help` answer at once.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -19,6 +19,8 @@ from lp_framework.errors import UserError, nearest
 
 KEY = re.compile(r"([\w@./-]+):( |$)")
 PACKAGE = re.compile(r"# @package (\S+)")
+# The keys of a config and the groups of which it chooses; those of an experiment have `override` before them.
+WORD = re.compile(r"^(?:  - |.*override /)?([\w/]+):", re.MULTILINE)
 # What every choice of a group begins with: the data module's settings for loading views.
 SHARED = {"data": {"/loader@_here_": "pairs"}}
 
@@ -33,8 +35,14 @@ class ConfigFile:
 
 
 def conf_folders(config_dir: str | None = None) -> list[Path]:
-    """The folders of configs, in the order in which Hydra looks a file up."""
+    """The folders of configs, in the order in which a file is looked up."""
     return [*([Path(config_dir)] if config_dir else []), registry.conf_dir(), *registry.conf_folders()]
+
+
+def find(path: str, config_dir: str | None = None) -> Path | None:
+    """The file of `GROUP/CHOICE` or `COMMAND`."""
+    files = (folder / f"{path}.yaml" for folder in conf_folders(config_dir))
+    return next((file for file in files if file.is_file()), None)
 
 
 def choices(group: str, config_dir: str | None = None) -> list[str]:
@@ -43,45 +51,41 @@ def choices(group: str, config_dir: str | None = None) -> list[str]:
     return sorted({*files, *(name for found, name in registry.plugin_classes() if found == group)})
 
 
-def groups(config_dir: str | None = None) -> list[str]:
-    """The groups that can be chosen from: the registry's and the folders of configs."""
-    folders = {each.name for folder in conf_folders(config_dir) for each in folder.glob("*/") if each.is_dir()}
-    return sorted({*registry.GROUPS, *folders} - {"hydra", "loader"})
-
-
 def origin(group: str, choice: str) -> str:
     """Where a choice comes from: "built-in", or the plugin that brings it."""
-    if (registry.conf_dir() / group / f"{choice}.yaml").is_file():
-        return registry.BUILT_IN
-    plugins = registry.plugin_classes()
-    if (group, choice) in plugins:
-        return plugins[group, choice][1]
-    return next(str(folder) for folder in registry.conf_folders() if (folder / group / f"{choice}.yaml").is_file())
+    for folder, where in {registry.conf_dir(): registry.BUILT_IN, **registry.conf_folders()}.items():
+        if (folder / group / f"{choice}.yaml").is_file():
+            return where
+    return registry.plugin_classes()[group, choice][1]
 
 
-# ---------------------------------------------------------------- as text, for listings and help
+def plugin_folders(overrides: Iterable[str]) -> list[str]:
+    """The folders of `plugins=[FOLDER,...]` on a command line."""
+    values = [override.partition("=")[2] for override in overrides if override.startswith("plugins=")]
+    folders = [folder.strip(" '\"") for value in values[-1:] for folder in value.strip("[]").split(",")]
+    return [folder for folder in folders if folder]
 
 
 def read(path: str, config_dir: str | None = None) -> ConfigFile:
     """`GROUP/CHOICE` or `COMMAND` as text, with the settings of the files of the same group that it builds on."""
-    file = next((each for folder in conf_folders(config_dir) if (each := folder / f"{path}.yaml").is_file()), None)
+    file = find(path, config_dir)
+    own = parse(file.read_text(encoding="utf-8") if file else "")
     group, _, choice = path.rpartition("/")
-    own = parse(file.read_text(encoding="utf-8")) if file else ConfigFile()
-    below = _signature_as_text(group, own.settings.get("name", [choice])[0].removeprefix("name: "))
-    own.summary = own.summary or below.summary
-    if group in SHARED and below.settings:
-        below.settings |= {key: lines for base in _paths(SHARED[group]) for key, lines in read(base).settings.items()}
-    for entry in own.defaults if group else []:
+    if not group:  # the defaults list of a command holds choices
+        return own
+    name = own.settings.get("name", [choice])[0].removeprefix("name: ")
+    below, entries = ConfigFile(), own.defaults
+    if (group, name) in registry.plugin_classes():
+        below = _signature(group, name)
+        entries = [*([SHARED[group]] if group in SHARED else []), *entries]
+    for entry in entries:
         if isinstance(entry, dict):  # {/loader@_here_: pairs}
-            below.settings |= {key: lines for base in _paths(entry) for key, lines in read(base).settings.items()}
-        elif entry != "_self_":
-            below.settings |= read(f"{group}/{entry}", config_dir).settings
-    return ConfigFile(own.summary, own.defaults, {**below.settings, **own.settings})
-
-
-def _paths(entry: Mapping[str, str]) -> list[str]:
-    """The configs that an entry of a defaults list puts right here, as `{/loader@_here_: pairs}` does."""
-    return [f"{key[1:-7]}/{choice}" for key, choice in entry.items() if key.endswith("@_here_")]
+            bases = [f"{key[1:-7]}/{value}" for key, value in entry.items() if key.endswith("@_here_")]
+        else:
+            bases = [f"{group}/{entry}"] if entry != "_self_" else []
+        for base in bases:
+            below.settings |= read(base, config_dir).settings
+    return ConfigFile(own.summary or below.summary, own.defaults, {**below.settings, **own.settings})
 
 
 def parse(text: str) -> ConfigFile:
@@ -99,57 +103,40 @@ def parse(text: str) -> ConfigFile:
             comments.append(line)
         elif block is not None and line.strip():
             block.append(line)
-    parts.settings.pop("defaults", None)
-    values = yaml.safe_load(text)
-    parts.defaults = (values.get("defaults") or []) if isinstance(values, dict) else []
+    defaults = yaml.safe_load("\n".join(parts.settings.pop("defaults", []))) or {}
+    parts.defaults = defaults.get("defaults") or []
     return parts
 
 
-def _signature_as_text(group: str, name: str) -> ConfigFile:
-    """A plugin's class: the first line of its docstring, and the defaults of its constructor."""
-    if (group, name) not in registry.plugin_classes():
-        return ConfigFile()
+def _signature(group: str, name: str) -> ConfigFile:
+    """A plugin's class as text: the first line of its docstring, and the defaults of its constructor."""
     cls, _ = registry.plugin_classes()[group, name]
-    arguments, _ = registry.parameters(cls)
-    values = {key: registry.MISSING if each.default is each.empty else each.default for key, each in arguments.items()}
-    lines = {key: [f"{key}: {'null' if value is None else value}"] for key, value in {"name": name, **values}.items()}
+    values = {key: "null" if value is None else value for key, value in plugin_defaults(cls).items()}
+    lines = {key: [f"{key}: {value}"] for key, value in {"name": name, **values}.items()}
     return ConfigFile((cls.__doc__ or "").strip().partition("\n")[0], settings=lines)
 
 
-# ---------------------------------------------------------------- experiments
+def plugin_defaults(cls: type) -> dict[str, Any]:
+    """The settings of a constructor, each with its default, or with the mark of what has to be given."""
+    settings, _ = registry.parameters(cls)
+    return {key: registry.MISSING if each.default is each.empty else each.default for key, each in settings.items()}
 
 
 def experiments(command: str, config_dir: str | None = None) -> list[str]:
-    """The experiments that belong to a command: it has all groups that they choose from, and they set nothing that
-    only other commands have."""
-    commands = {file.stem: _keys(file) for folder in conf_folders(config_dir) for file in folder.glob("*.yaml")}
-    own = {"experiment", *commands[command], *commands["base"]}
-    others = {key for keys in commands.values() for key in keys} - own
-    found = []
-    for folder in conf_folders(config_dir):
-        for file in folder.glob("experiment/*.yaml"):
-            keys = _keys(file)
-            chosen = {key.partition("override /")[2] for key in keys} - {""}
-            if chosen <= own and not keys & others:
-                found.append(file.stem)
-    return sorted(found)
+    """The experiments that choose and set nothing that only other commands have."""
+    folders = conf_folders(config_dir)
+    words = {file.stem: _words(file) for folder in folders for file in folder.glob("*.yaml")}
+    others = {word for each in words.values() for word in each} - words[command] - words["base"] - {"experiment"}
+    files = [file for folder in folders for file in folder.glob("experiment/*.yaml")]
+    return sorted(file.stem for file in files if not _words(file) & others)
 
 
-def _keys(file: Path) -> set[str]:
-    """The keys of a file and the groups in its defaults list; nothing of a file that is not valid."""
-    try:
-        parts = parse(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, OSError, UnicodeDecodeError):
-        return set()
-    entries = parts.defaults if isinstance(parts.defaults, list) else []
-    return {*parts.settings, *(str(key) for entry in entries if isinstance(entry, dict) for key in entry)}
-
-
-# ---------------------------------------------------------------- as values
+def _words(file: Path) -> set[str]:
+    return set(WORD.findall(file.read_text(encoding="utf-8", errors="replace")))
 
 
 def values(group: str, choice: str) -> dict[str, Any]:
-    """The settings of a built-in choice, presets included, by name."""
+    """The settings of a choice, presets included, by name."""
     from omegaconf import OmegaConf
 
     known = choices(group)
@@ -160,90 +147,18 @@ def values(group: str, choice: str) -> dict[str, Any]:
     return {str(key): value for key, value in found.items()}
 
 
-class Node(NamedTuple):
-    """A config that a plugin brings, as Hydra's config store takes it."""
-
-    group: str
-    name: str
-    package: str | None
-    values: dict[str, Any]
-
-
-def plugin_nodes() -> Iterator[Node | str]:
-    """The configs of all plugins; instead of one that is not valid, a sentence that says what is wrong with it.
-
-    A class's settings are those of its constructor, with the values of the YAML files that name it. Everything else in
-    a plugin's conf folder is passed on as it is.
-    """
-    classes = registry.plugin_classes()
-    with_file = set()
-    for folder in registry.conf_folders():
-        for file in sorted(folder.rglob("*.yaml")):
-            group = file.parent.relative_to(folder).as_posix()
-            try:
-                text = file.read_text(encoding="utf-8")
-                content = yaml.safe_load(text)
-                if not isinstance(content, dict):
-                    raise UserError("a configuration is a mapping 'key: value', not a list")
-                found = group, str(content.get("name", file.stem))
-                if found in classes:
-                    content = _merged(classes[found][0], *found, content)
-                    with_file.add((group, file.stem))
-            except (UserError, yaml.YAMLError, UnicodeDecodeError) as error:
-                yield f"{file}: {' '.join(str(error).split())}"
-                continue
-            package = PACKAGE.search(text)
-            yield Node(group, file.stem, package[1] if package else None, content)
-    for (group, name), (cls, where) in classes.items():
-        if (group, name) not in with_file:
-            try:
-                yield Node(group, name, None, _merged(cls, group, name, {}))
-            except UserError as error:
-                yield f"{where}: {error}"
-
-
-def _merged(cls: type, group: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a plugin's class: its constructor's, and `content` over them."""
-    from hydra_zen import builds  # takes a while to import
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        built: Any = builds(cls, populate_full_signature=True, zen_exclude=registry.component_names(cls))
-        defaults: Any = OmegaConf.to_container(OmegaConf.structured(built))
-    except (TypeError, ValueError, OmegaConfBaseException) as error:
-        raise UserError(f"{group} '{name}' has a setting that no configuration can hold ({error})") from error
-    defaults.pop("_target_", None)
-    known = ["name", *defaults]
-    for key in content:
-        if key not in known and key != "defaults" and group not in SHARED:
-            raise UserError(f"{group} '{name}' has no '{key}'{nearest(str(key), known)} (known: {', '.join(known)})")
-    shared = {"defaults": [SHARED[group], "_self_"]} if group in SHARED else {}
-    return {**shared, "name": name, **defaults, **content}
-
-
-# ---------------------------------------------------------------- the help of a command
-
-
-def chosen(command: str, overrides: Sequence[str], config_dir: str | None = None) -> dict[str, str | None]:
-    """The groups of a command's config, each with what is chosen of it by default or by `group=CHOICE`."""
-    entries = [entry for entry in read(command, config_dir).defaults if isinstance(entry, dict)]
-    found = {str(group): choice for entry in entries for group, choice in entry.items()}
-    given = dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
-    return {group: given.get(group, choice) for group, choice in found.items()}
-
-
 def command_help(command: str, overrides: Sequence[str], config_dir: str | None = None) -> str:
     """What a command is for, what can be chosen, and each setting with the comment from its YAML file."""
     config = read(command, config_dir)
-    groups = chosen(command, overrides, config_dir)
+    given = dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
+    entries = [entry for entry in config.defaults if isinstance(entry, dict)]
+    groups = {group: given.get(group, choice) for entry in entries for group, choice in entry.items()}
     lines = [f"Usage: lp {command} [key=value ...] [options]", "", config.summary, "", "Choose (group=choice):", ""]
     for group in groups:
         known = experiments(command, config_dir) if group == "experiment" else choices(group, config_dir)
         lines.append(f"  {group + ':':12}{', '.join(known)}")
     lines += ["", "Settings (key=value):", ""]
-    plain = {key: block for key, block in config.settings.items() if key not in groups}
-    lines += [f"  {line}" for block in plain.values() for line in block]
+    lines += [f"  {line}" for key, block in config.settings.items() if key not in groups for line in block]
     for group, choice in groups.items():
         if choice is None or group == "experiment":
             continue

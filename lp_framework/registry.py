@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-import importlib.util
 import inspect
 import json
 import sys
@@ -28,7 +27,6 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,11 +55,10 @@ _Class = TypeVar("_Class", bound=type)
 class _State:
     """What has been found so far."""
 
-    classes: dict[Key, type] = field(default_factory=dict)
-    origins: dict[Key, str] = field(default_factory=dict)
-    failures: dict[str, str] = field(default_factory=dict)
-    conf_folders: list[Path] = field(default_factory=list)
-    seen: set[str] = field(default_factory=set)  # plugins already tried, by folder or entry point
+    classes: dict[Key, tuple[type, str]] = field(default_factory=dict)  # with their origins
+    conf_folders: dict[Path, str] = field(default_factory=dict)  # with their origins
+    failures: dict[str, str] = field(default_factory=dict)  # by origin
+    seen: set[str] = field(default_factory=set)  # where has been looked already
     loading: str | None = None  # origin of the plugin being imported
 
 
@@ -83,15 +80,13 @@ def register(group: str, name: str) -> Callable[[_Class], _Class]:
         origin = BUILT_IN if built_in else _state.loading or f"module {cls.__module__}"
         if not built_in and (conf_dir() / group / f"{name}.yaml").is_file():
             raise UserError(f"{group} '{name}' of {origin} has the name of a built-in {group}; give it another name")
-        other = _state.classes.get((group, name), cls)
+        other, where = _state.classes.get((group, name), (cls, origin))
         if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
             raise UserError(
-                f"{group} '{name}' is registered twice: by {other.__module__}.{other.__qualname__} "
-                f"({_state.origins[group, name]}) and by {cls.__module__}.{cls.__qualname__} ({origin}); "
-                "give one of them another name"
+                f"{group} '{name}' is registered twice: by {other.__module__}.{other.__qualname__} ({where}) "
+                f"and by {cls.__module__}.{cls.__qualname__} ({origin}); give one of them another name"
             )
-        _state.classes[group, name] = cls
-        _state.origins[group, name] = origin
+        _state.classes[group, name] = cls, origin
         return cls
 
     return record
@@ -124,13 +119,13 @@ def get(group: str, name: str) -> type:
     known = names(group)
     if name not in known:
         raise UserError(f"there is no {group} '{name}'{nearest(name, known)} (known: {', '.join(known) or 'none'})")
-    return _state.classes[group, name]
+    return _state.classes[group, name][0]
 
 
 def plugin_classes() -> dict[Key, tuple[type, str]]:
     """The classes that plugins have registered, by group and name, each with its origin."""
     discover()
-    return {key: (cls, _state.origins[key]) for key, cls in _state.classes.items() if _state.origins[key] != BUILT_IN}
+    return {key: (cls, origin) for key, (cls, origin) in _state.classes.items() if origin != BUILT_IN}
 
 
 def failures() -> dict[str, str]:
@@ -139,10 +134,10 @@ def failures() -> dict[str, str]:
     return dict(_state.failures)
 
 
-def conf_folders() -> list[Path]:
-    """The `conf/` folders that plugins bring, in the order in which the plugins were found."""
+def conf_folders() -> dict[Path, str]:
+    """The `conf/` folders that plugins bring, each with its origin, in the order in which the plugins were found."""
     discover()
-    return list(_state.conf_folders)
+    return dict(_state.conf_folders)
 
 
 # ---------------------------------------------------------------- building
@@ -163,20 +158,16 @@ def build(group: str, settings: Mapping[str, Any] | str, **components: object) -
     arguments, wanted = parameters(cls)
     for key in values:
         if key not in arguments:
-            reason = "is a component, not a setting" if key in wanted else "is not one of its settings"
-            raise UserError(
-                f"{group} '{name}': '{key}' {reason}{nearest(key, arguments)} (known: {', '.join(arguments) or 'none'})"
-            )
+            known = f"{nearest(key, arguments)} (known: {', '.join(arguments) or 'none'})"
+            raise UserError(f"{group} '{name}': '{key}' is not one of its settings{known}")
     for key, parameter in arguments.items():
-        value = values.get(key, parameter.default)
-        if value is inspect.Parameter.empty or (isinstance(value, str) and value == MISSING):
+        if values.get(key, MISSING if parameter.default is parameter.empty else None) == MISSING:
             raise UserError(f"{group} '{name}' needs a value for '{key}': give {group}.{key}=VALUE")
-    values = checked(cls.__init__, values, f"{group} '{name}': ")  # type: ignore[misc]
     passed = {key: components[key] for key in wanted if components.get(key) is not None}
     for key, parameter in wanted.items():
-        if key not in passed and parameter.default is inspect.Parameter.empty:
+        if key not in passed and parameter.default is parameter.empty:
             raise UserError(f"{group} '{name}' needs a {key}: choose one with {key}=NAME")
-    return cls(**values, **passed)
+    return cls(**checked(cls.__init__, values, f"{group} '{name}': "), **passed)  # type: ignore[misc]
 
 
 def component_names(cls: type) -> list[str]:
@@ -232,45 +223,34 @@ def checked(function: Callable[..., Any], values: Mapping[str, Any], prefix: str
 def discover(folders: Iterable[str | Path] = ()) -> None:
     """Load the plugins: entry points, `plugins/` of the working directory, and `folders`; each of them once.
 
-    Raises `UserError` for a folder that does not exist or holds no plugin.
+    Raises `UserError` for one of the `folders` that does not exist or holds no plugin.
     """
     if _state.loading is not None:  # a plugin that asks for names while it is being imported
         return
-    for point in _entry_points():
-        if _first_time(f"entry point {point.name}={point.value}"):
+    if _first_time(ENTRY_POINTS):
+        for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
             package = f"{point.dist.name} {point.dist.version}" if point.dist else point.name
             with _guarded(f"package {package}"):
                 _import(point.module)
-    here = Path("plugins")
-    if here.is_dir():
-        _load_folder(here.resolve())
+    for plugin in _plugins(Path("plugins")):
+        _load_plugin(plugin)
     for folder in map(Path, folders):
-        if not folder.is_dir():
-            raise UserError(f"plugins=[{folder}]: there is no such folder (looked in {Path.cwd()})")
-        if not _load_folder(folder.resolve()):
-            raise UserError(f"plugins=[{folder}]: neither this folder nor a folder in it holds Python files")
-
-
-@cache
-def _entry_points() -> tuple[importlib.metadata.EntryPoint, ...]:
-    """Cached, because it reads the metadata of every package that is installed."""
-    return tuple(importlib.metadata.entry_points(group=ENTRY_POINTS))
-
-
-def _first_time(plugin: str) -> bool:
-    if plugin in _state.seen:
-        return False
-    _state.seen.add(plugin)
-    return True
-
-
-def _load_folder(folder: Path) -> bool:
-    """Load the folder's plugin, or the plugins one level down; whether there is any."""
-    plugins = [folder] if _is_plugin(folder) else sorted(filter(_is_plugin, folder.iterdir()))
-    for plugin in plugins:
-        if _first_time(str(plugin)):
+        plugins = _plugins(folder)
+        if not plugins:
+            raise UserError(f"plugins=[{folder}]: is no folder with Python files, nor holds one (below {Path.cwd()})")
+        for plugin in plugins:
             _load_plugin(plugin)
-    return bool(plugins)
+
+
+def _first_time(place: str) -> bool:
+    first = place not in _state.seen
+    _state.seen.add(place)
+    return first
+
+
+def _plugins(folder: Path) -> list[Path]:
+    """The folder itself where it is a plugin, otherwise the plugins one level down."""
+    return [folder] if _is_plugin(folder) else sorted(filter(_is_plugin, folder.glob("*")))
 
 
 def _is_plugin(folder: Path) -> bool:
@@ -278,53 +258,43 @@ def _is_plugin(folder: Path) -> bool:
 
 
 def _load_plugin(folder: Path) -> None:
-    relative = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-    with _guarded(f"folder {relative}"):
-        modules = _modules(folder)
-        if not modules:
+    """Import the modules and packages of a plugin's folder; of a folder that is a package, only that package."""
+    place = folder.resolve()
+    if not _first_time(str(place)):
+        return
+    files = [*place.glob("*.py"), *place.glob("*/__init__.py")]
+    if (place / "__init__.py").exists():
+        place, files = place.parent, [place / "__init__.py"]
+    modules = {file.parent.name if file.stem == "__init__" else file.stem: file for file in sorted(files)}
+    wanted = [name for name in modules if name not in ("setup", "conftest", "tests") and not name.startswith("test_")]
+    with _guarded(f"folder {folder}"):
+        if not wanted:
             raise ImportError("it holds no Python module or package")
-        place = folder.parent if (folder / "__init__.py").exists() else folder
         if str(place) not in sys.path:
             sys.path.append(str(place))
         importlib.invalidate_caches()
-        for name, file in modules.items():
-            spec = importlib.util.find_spec(name)
-            if spec is None or spec.origin is None or Path(spec.origin).resolve() != file:
-                raise ImportError(f"the name of its module '{name}' is taken by {spec.origin if spec else 'another'}")
-            _import(name)
+        for name in wanted:
+            _import(name, modules[name])
 
 
-def _modules(folder: Path) -> dict[str, Path]:
-    """The modules and packages of a plugin's folder by name; of a folder that is a package, only that package."""
-    if (folder / "__init__.py").exists():
-        return {folder.name: folder / "__init__.py"}
-    modules = {file.stem: file for file in sorted(folder.glob("*.py"))}
-    packages = {file.parent.name: file for file in sorted(folder.glob("*/__init__.py"))}
-    return {
-        name: file
-        for name, file in {**modules, **packages}.items()
-        if name not in ("setup", "conftest", "tests") and not name.startswith("test_")
-    }
-
-
-def _import(module: str) -> None:
-    file = importlib.import_module(module).__file__
-    conf = Path(file).parent / "conf" if file else None
-    if conf is not None and conf.is_dir() and conf not in _state.conf_folders:
-        _state.conf_folders.append(conf)
+def _import(name: str, wanted: Path | None = None) -> None:
+    """Import a module, which has to be that of the file `wanted`, and note the `conf/` folder beside it."""
+    file = getattr(importlib.import_module(name), "__file__", None)
+    if wanted is not None and (file is None or Path(file).resolve() != wanted):
+        raise ImportError(f"the name of its module '{name}' is taken by {file or 'another'}")
+    if file is not None and (conf := Path(file).parent / "conf").is_dir():
+        _state.conf_folders.setdefault(conf, str(_state.loading))
 
 
 @contextmanager
 def _guarded(origin: str) -> Iterator[None]:
     """Import a plugin: what it registers gets `origin`; when it fails, nothing of it stays but the error."""
-    classes, origins = dict(_state.classes), dict(_state.origins)
     _state.loading = origin
     try:
         yield
     except (Exception, SystemExit) as error:
-        built_in = {key for key, where in _state.origins.items() if where == BUILT_IN}
-        classes.update({key: _state.classes[key] for key in built_in})
-        _state.classes, _state.origins = classes, {**origins, **dict.fromkeys(built_in, BUILT_IN)}
+        _state.classes = {key: each for key, each in _state.classes.items() if each[1] != origin}
+        _state.conf_folders = {each: where for each, where in _state.conf_folders.items() if where != origin}
         _state.failures[origin] = f"{type(error).__name__}: {error}"
     finally:
         _state.loading = None

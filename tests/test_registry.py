@@ -58,7 +58,7 @@ def test_settings_come_from_the_config_and_components_from_the_caller(step):
         ({"name": "tmp_stop"}, {}, "there is no solver 'tmp_stop'; did you mean 'tmp_step'? (known: "),
         ({"name": "tmp_step", "gama": 1}, {"model": 1}, "'gama' is not one of its settings; did you mean 'gamma'?"),
         ({"name": "tmp_step"}, {}, "solver 'tmp_step' needs a model: choose one with model=NAME"),
-        ({"name": "tmp_step", "prior": 1}, {"model": 1}, "'prior' is a component, not a setting"),
+        ({"name": "tmp_step", "prior": 1}, {"model": 1}, "'prior' is not one of its settings"),
         ({"name": "tmp_step", "gamma": "???"}, {"model": 1}, "needs a value for 'gamma': give solver.gamma=VALUE"),
         (
             {"name": "tmp_step", "order": "frist"},

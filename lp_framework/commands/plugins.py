@@ -27,10 +27,9 @@ def main(arguments: Sequence[str]) -> None:
         print(USAGE)
         return
     for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key != "plugins" or not value:
+        if not argument.startswith("plugins="):
             raise UserError(f"'{argument}' is not an argument of this command; it takes plugins=FOLDER,...")
-        registry.discover(folder.strip() for folder in value.strip("[]").split(","))
+    registry.discover(catalogue.plugin_folders(arguments))
     terminal = sys.stdout.isatty()
     console = Console(highlight=False, width=None if terminal else 10_000)
     for group in registry.GROUPS:
