@@ -10,68 +10,55 @@ Lightning imports torchvision by way of torchmetrics, so `install` sees to it wh
 
 from __future__ import annotations
 
-import importlib.abc
-import importlib.machinery
 import importlib.util
 import sys
-from collections.abc import Sequence
-from types import ModuleType
+from pathlib import Path
 from typing import Any
 
-_SCHEMAS = (
-    "nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
-    "qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
-)
+_OPERATORS = ("nms", "qnms")
 _declared: list[Any] = []  # torch.library.Library: a declaration lasts as long as its object
+
+
+class _Watch:
+    """A finder that finds no module, but notices when torchvision is looked for."""
+
+    @classmethod
+    def find_spec(cls, fullname: str, path: object, target: object = None) -> None:
+        if fullname == "torchvision":
+            ensure()
 
 
 def install() -> None:
     """Have `ensure` called when torchvision is first imported; costs nothing until then."""
-    if "torchvision" not in sys.modules and not any(isinstance(finder, _Watch) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Watch())
-
-
-class _Watch(importlib.abc.MetaPathFinder):
-    """Finds no module, but notices when torchvision is looked for."""
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        if fullname == "torchvision":
-            ensure()
-        return None
+    if "torchvision" not in sys.modules and _Watch not in sys.meta_path:
+        sys.meta_path.insert(0, _Watch)
 
 
 def ensure() -> None:
     """Call it before the first `import torchvision`; where torchvision is healthy it changes nothing."""
-    # Looking for torchvision is what the watch waits for: it must not call this again from within.
-    sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _Watch)]
+    if _Watch in sys.meta_path:
+        sys.meta_path.remove(_Watch)  # else looking for torchvision would call this again from within
     if "torchvision" in sys.modules or _declared or _extension_loads():
         return
     import torch
 
     library = torch.library.Library("torchvision", "DEF")
-    for schema in _SCHEMAS:
-        library.define(schema)
+    for name in _OPERATORS:
+        library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
     _declared.append(library)
 
 
 def _extension_loads() -> bool:
     """Whether torchvision's compiled operators load; they stay loaded, as its own import would leave them."""
     package = importlib.util.find_spec("torchvision")
-    if package is None or not package.submodule_search_locations:
+    if package is None or package.origin is None:
         return True  # not installed: nothing to mend
-    suffixes = importlib.machinery.EXTENSION_SUFFIXES
-    finder = importlib.machinery.FileFinder(
-        package.submodule_search_locations[0], (importlib.machinery.ExtensionFileLoader, suffixes)
-    )
-    extension = finder.find_spec("_C")
-    if extension is None or extension.origin is None:
-        return False
     import torch
 
     try:
-        torch.ops.load_library(extension.origin)
+        for file in Path(package.origin).parent.glob("_C.*"):
+            torch.ops.load_library(file)
+            return True
     except OSError:
-        return False
-    return True
+        pass
+    return False

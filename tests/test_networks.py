@@ -310,8 +310,8 @@ def test_the_papers_resnet_has_2048_features_and_is_trained():
 
 
 def test_an_unknown_resnet_is_named_with_the_nearest():
-    with pytest.raises(UserError, match=r"backbone.arch='resnet5' is not known; did you mean 'resnet50'.*resnet101"):
-        ResNet("resnet5")
+    with pytest.raises(UserError, match=r"arch=resnet5 does not fit.*resnet101; did you mean 'resnet50'"):
+        registry.build("backbone", {"name": "resnet", "arch": "resnet5"})
 
 
 def test_efficientnet_brings_real_weights_without_network(no_network):

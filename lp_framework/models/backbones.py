@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import warnings
+from typing import Literal
 
 import torch
 from torch import Tensor, distributed, nn
 from torch.nn import functional
 
-from lp_framework.errors import UserError, nearest
 from lp_framework.registry import register
 
-RESNETS = {"resnet18": 512, "resnet34": 512, "resnet50": 2048, "resnet101": 2048}  # feature channels
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 # Images through a frozen trunk at once: on a CPU, 64 take five times as long as one by one, most of it for memory.
@@ -38,16 +37,13 @@ class Backbone(nn.Module):
 
     def trunk(self, images: Tensor) -> Tensor:
         """`[I, trunk_dim]` for images `[I, 3, H, W]` in [-1, 1] of any size."""
-        if not self.frozen:
-            return self._trunk(images)
-        pieces = images.split(ON_CPU if images.device.type == "cpu" else ON_GPU)
-        return torch.cat([self._trunk(piece) for piece in pieces])
-
-    def _trunk(self, images: Tensor) -> Tensor:
-        if images.shape[-2:] != (self.image_size, self.image_size):
-            size = (self.image_size, self.image_size)
-            images = functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
-        return self.trunk_features(images)
+        size, features = (self.image_size, self.image_size), []
+        at_once = ON_CPU if images.device.type == "cpu" else ON_GPU
+        for piece in images.split(at_once) if self.frozen else (images,):
+            if piece.shape[-2:] != size:
+                piece = functional.interpolate(piece, size, mode="bilinear", antialias=True, align_corners=False)
+            features.append(self.trunk_features(piece))
+        return torch.cat(features)
 
     def forward(self, images: Tensor) -> Tensor:
         """Features `[I, feature_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
@@ -169,18 +165,18 @@ class ResNet(Backbone):
     std: Tensor
 
     def __init__(
-        self, arch: str = "resnet50", pretrained: bool = True, frozen: bool = False, image_size: int = 224
+        self,
+        arch: Literal["resnet18", "resnet34", "resnet50", "resnet101"] = "resnet50",
+        pretrained: bool = True,
+        frozen: bool = False,
+        image_size: int = 224,
     ) -> None:
         super().__init__()
-        if arch not in RESNETS:
-            raise UserError(
-                f"backbone.arch='{arch}' is not known{nearest(arch, RESNETS)} (known: {', '.join(RESNETS)})"
-            )
         from torchvision.models import get_model
 
         self.image_size, self.frozen = image_size, frozen
-        self.trunk_dim = self.feature_dim = RESNETS[arch]
         self.resnet = get_model(arch, weights=None)
+        self.trunk_dim = self.feature_dim = self.resnet.fc.in_features
         if pretrained:
             self._load_imagenet(arch)
         self.resnet.fc = nn.Identity()
