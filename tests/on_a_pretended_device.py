@@ -206,7 +206,7 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
     result = Evaluation.result
 
     def gathered(evaluation: Evaluation) -> dict[str, Any]:
-        gathered_on.extend({each.device for each in (*evaluation.metrics.pair, *evaluation.costs.cost)})
+        gathered_on.extend({each.device for each in (*evaluation.metrics.pair, *evaluation.metrics.cost)})
         return result(evaluation)
 
     def save(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:

@@ -18,7 +18,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lp_framework.evaluation.metrics import PoseMetrics, median, summarise
+from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch, median, summarise
 from lp_framework.evaluation.tables import summary_rows, write_json
 from lp_framework.models.pair_mean import PairMean, first_of_each
 
@@ -106,7 +106,7 @@ def test_the_median(values, expected):
 
 
 def rows(pairs: int = 60, starts: int = 3, seed: int = 0) -> tuple[torch.Tensor, ...]:
-    """What `update` takes, for pairs of all four objects in a random order, not all that there are."""
+    """What a batch has, for pairs of all four objects in a random order, not all that there are."""
     random = np.random.default_rng(seed)
     number = torch.from_numpy(random.permutation(1_000)[:pairs])
     pair = torch.stack([number // 32, number % 32], dim=1)
@@ -115,11 +115,16 @@ def rows(pairs: int = 60, starts: int = 3, seed: int = 0) -> tuple[torch.Tensor,
     return pair, torch.from_numpy(random.integers(4, size=pairs)), rotation, translation, chosen, answer
 
 
+def solved(given: tuple[torch.Tensor, ...]) -> SolvedBatch:
+    """A batch of these rows, each of which has taken half a second and three passes."""
+    return SolvedBatch(*given, seconds=0.5 * len(given[0]), passes=3 * len(given[0]))
+
+
 def fed(given: tuple[torch.Tensor, ...], batch: int = 7) -> PoseMetrics:
     """A metric that got the rows in batches."""
     metrics = PoseMetrics(NAMES, AMBIGUITIES, UNIQUE)
     for start in range(0, len(given[0]), batch):
-        metrics.update(*(each[start : start + batch] for each in given))
+        metrics.update(solved(tuple(each[start : start + batch] for each in given)))
     return metrics
 
 
@@ -137,6 +142,8 @@ def expected(given: tuple[torch.Tensor, ...]) -> dict[str, Any]:
         "per_ambiguity": {"unique": over([0]), "twofold": over([1]), "continuous": over([2, 3])},
         "unanswered": float(np.isnan(rotation[np.arange(len(pair)), chosen]).mean()),
         "pairs": len(pair),
+        "seconds_per_pair": 0.5,
+        "network_passes_per_pair": 3.0,
     }
 
 
@@ -160,7 +167,7 @@ def test_objects_without_pairs_and_sets_without_labels_have_none():
     assert result["per_object"]["cup"] is None
     assert result["per_object"]["vase"] == result["metrics"]
     unlabelled = PoseMetrics(["a"], ["unlabelled"], [None])
-    unlabelled.update(given[0], torch.zeros(5, dtype=torch.long), *given[2:])
+    unlabelled.update(solved((given[0], torch.zeros(5, dtype=torch.long), *given[2:])))
     result = unlabelled.compute()
     assert result["metrics_unique_answer"] is None
     assert same(result["per_ambiguity"], {"unlabelled": result["metrics"]})
@@ -181,11 +188,11 @@ def test_rows_are_sorted_whole_and_up_to_date():
     for state, value in zip(("pair", "object", "rotation", "translation", "chosen", "answer"), given, strict=True):
         torch.testing.assert_close(metrics.rows()[state], value[order], rtol=0, atol=0, equal_nan=True)
     more = rows(pairs=4)
-    metrics.update(more[0] + 5_000, *more[1:])
+    metrics.update(solved((more[0] + 5_000, *more[1:])))
     assert len(metrics.rows()["pair"]) == 64
     metrics.compute()
     metrics.reset()
-    metrics.update(*more)
+    metrics.update(solved(more))
     assert len(metrics.rows()["pair"]) == 4
 
 
@@ -193,7 +200,7 @@ def test_rows_are_sorted_whole_and_up_to_date():
 def test_pickled_and_cloned_metrics_go_on(copied):
     given = rows()
     metrics = copied(fed(tuple(each[:30] for each in given)))
-    metrics.update(*(each[30:] for each in given))
+    metrics.update(solved(tuple(each[30:] for each in given)))
     assert same(metrics.compute(), expected(given))
 
 
@@ -216,7 +223,7 @@ SHARE = """
     from lp_framework import torchvision_ops
     torchvision_ops.install()
     import torch
-    from lp_framework.evaluation.metrics import PoseMetrics
+    from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch
     from lp_framework.models.backbones import Standardise
     from lp_framework.models.pair_mean import PairMean
 
@@ -228,7 +235,7 @@ SHARE = """
     assert len(batches) % 2  # so one batch is met twice
     for step in range((len(batches) + 1) // 2):
         batch = batches[(2 * step + rank) % len(batches)]
-        metrics.update(*batch)
+        metrics.update(SolvedBatch(*batch, seconds=0.5 * len(batch[0]), passes=3 * len(batch[0])))
         mean.update(batch[0], batch[2].nan_to_num(nan=100.0).mean(dim=1))
     result = metrics.compute()
     result = {**result, "mean": mean.compute().item(), "rows": metrics.rows()["pair"].tolist()}

@@ -17,7 +17,7 @@ from lp_framework.analysis.examples import read_examples
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.source import RenderingsData
 from lp_framework.errors import UserError
-from lp_framework.evaluation.view_sets import ViewSetEvaluation
+from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution
 from lp_framework.solvers.starts import Random
 
@@ -99,7 +99,7 @@ def test_a_solver_is_asked_for_sets_and_its_answers_come_back_image_by_image(dat
     data.evaluate_on_sets(3)
     data.prepare_data()
     (batch,) = data.test_dataloader()
-    evaluation = ViewSetEvaluation(Remembering(), Random(2), seed=3, views=3)
+    evaluation = Evaluation(Remembering(), Random(2), seed=3, views=3)
     evaluation.gather_for(data.table("test"))
     evaluation.test_step(batch, 0)
     ((asked, starts),) = evaluation.solver.asked
@@ -124,7 +124,7 @@ def test_a_sets_id_is_that_of_its_images_wherever_it_is_evaluated(data):
     for chosen in (range(2 * TEST_VIEWS), order):
         sets = table.view_sets(3)[list(chosen)]
         pairs = np.stack([np.repeat(sets[:, :1], 2, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
-        evaluation = ViewSetEvaluation(Remembering(), Random(2), seed=0, views=3)
+        evaluation = Evaluation(Remembering(), Random(2), seed=0, views=3)
         evaluation.gather_for(table)
         evaluation.test_step(data.data("test")[pairs], 0)
         ((asked, starts),) = evaluation.solver.asked

@@ -37,7 +37,6 @@ from lp_framework.data.photographs import save_png
 from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import write_text
-from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Cost, Solution
@@ -84,7 +83,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     views = rows["pair"][numbers].numpy()
     pairs, shown = shown_pairs(data, views, evaluation.device, [pick.reason for pick in picks])
     starts = evaluation.starts.make(pairs, evaluation.seed)
-    solver, sets = evaluation.solver, isinstance(evaluation, ViewSetEvaluation)
+    solver, sets = evaluation.solver, evaluation.views is not None
     if sets:
         solution = _of_answers(rows["answer"][numbers, None].to(starts))
         shown = [with_solution(pair, solution, starts, place) for place, pair in enumerate(shown)]
@@ -123,8 +122,8 @@ def _of_answers(poses: Tensor) -> Solution:
 
 def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
     """Whether the prior's landscapes of so many pairs take little time, by what the evaluation's own passes took."""
-    costs = evaluation.costs.compute()
-    seconds, before = costs["seconds"], costs["passes"]
+    cost = evaluation.result()
+    seconds, before = (cost["pairs"] * cost[f"{what}_per_pair"] for what in ("seconds", "network_passes"))
     latitude, longitude = landscape_grid()
     passes = 2 * pairs * len(draws.steps()) * len(latitude) * len(longitude)  # both directions
     return before > 0 and passes * seconds / before <= max(SECONDS, SHARE * seconds)

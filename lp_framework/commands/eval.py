@@ -34,7 +34,6 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.journal import Journal, goes_on, unfinished
 from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
-from lp_framework.evaluation.view_sets import ViewSetEvaluation
 from lp_framework.models.checkpoints import find_checkpoint
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Solver
@@ -79,15 +78,13 @@ def run(config: DictConfig) -> None:
     trainer = build_trainer(settings["trainer"], folder, [RichProgressBar(leave=False)], logger=[])
     batch_pairs = pairs_at_once(settings["batch_pairs"], solver, starts)
     seed, views, protocol = settings["seed"], settings["views"], settings["protocol"]
-    evaluation: Evaluation
+    evaluation = Evaluation(solver, starts, seed, journal, views)
     if views is None:
         data.evaluate_on(protocol, seed, batch_pairs)
-        evaluation = Evaluation(solver, starts, seed, journal)
     elif protocol != "ordered":
         raise UserError(f"protocol={protocol} is for pairs; views={views} has a protocol of its own, leave it out")
     else:
         data.evaluate_on_sets(views, batch_pairs)
-        evaluation = ViewSetEvaluation(solver, starts, seed, views, journal)
     trainer.test(evaluation, datamodule=data, verbose=False)
     evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather
     result = {

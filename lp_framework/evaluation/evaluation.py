@@ -12,7 +12,7 @@ from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch, ViewTable
 from lp_framework.errors import UserError
 from lp_framework.evaluation.journal import Journal
-from lp_framework.evaluation.metrics import Costs, PoseMetrics, SolvedBatch, without_success_rates
+from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch, without_success_rates
 from lp_framework.geometry import (
     apply_relative_pose,
     at_optimal_scale,
@@ -21,7 +21,8 @@ from lp_framework.geometry import (
     rotation_error,
     translation_error,
 )
-from lp_framework.solvers.base import Solution, Solver, pairs_of
+from lp_framework.keyed_random import keyed_bits
+from lp_framework.solvers.base import Solution, Solver, ViewSets, pairs_of
 from lp_framework.solvers.starts import Starts
 
 
@@ -30,17 +31,22 @@ class Evaluation(LightningModule):
 
     Afterwards `result` gives the metrics (see `PoseMetrics`), `metrics.rows()` a row a pair. With a `journal` every
     batch is kept as it comes, and batches that the journal has from an earlier run are not solved again.
+
+    With `views` it is of `solve_views` on sets of so many images, with the batches of
+    `PairDataModule.evaluate_on_sets`. Metrics and rows are those of pairs: the first image of a set is the reference of
+    each of its others, whose pose relative to it is judged. A set has one answer, so SR equals R.
     """
 
     table: ViewTable
     metrics: PoseMetrics
 
-    def __init__(self, solver: Solver, starts: Starts, seed: int, journal: Journal | None = None) -> None:
+    def __init__(
+        self, solver: Solver, starts: Starts, seed: int, journal: Journal | None = None, views: int | None = None
+    ) -> None:
         super().__init__()
-        self.solver, self.starts, self.seed, self.journal = solver, starts, seed, journal
+        self.solver, self.starts, self.seed, self.journal, self.views = solver, starts, seed, journal, views
         # Registered, so that Lightning moves the networks of the solver to the device.
         self.networks = torch.nn.ModuleList(solver.networks())
-        self.costs = Costs()
 
     def setup(self, stage: str) -> None:
         """The objects are known once the data are prepared."""
@@ -68,12 +74,7 @@ class Evaluation(LightningModule):
         self.print(f"going on: {len(pairs.unique(dim=0))} pairs have been solved before")
         # Each process has some, since a metric without any cannot be gathered.
         for batch in found[self.trainer.global_rank :: self.trainer.world_size] or found[:1]:
-            self.count(batch)
-
-    def count(self, batch: SolvedBatch) -> None:
-        """Add solved pairs to the metrics."""
-        self.metrics.update(*batch[:-2])
-        self.costs.update(batch.pair, batch.seconds, batch.passes)
+            self.metrics.update(batch)
 
     def gather_for(self, table: ViewTable) -> None:
         """Start with no results, for pairs of the views in `table`."""
@@ -81,9 +82,22 @@ class Evaluation(LightningModule):
         self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer)
 
     def solve(self, batch: PairBatch) -> Solution:
-        """The solver's solution of a batch's pairs."""
+        """The solver's solution of a batch's pairs, or of its sets as one of those pairs."""
         pairs = pairs_of(batch, self.device)
-        return self.solver.solve(pairs, self.starts.make(pairs, self.seed), self.seed)
+        starts = self.starts.make(pairs, self.seed)
+        if self.views is None:
+            return self.solver.solve(pairs, starts, self.seed)
+        ids = pairs.ids.view(-1, self.views - 1)
+        views = torch.cat([pairs.reference.view_as(ids)[:, :1], pairs.query.view_as(ids)], dim=1)
+        view_sets = ViewSets(pairs.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0].to(ids.device))
+        solution = self.solver.solve_views(view_sets, starts.unflatten(0, ids.shape), self.seed)
+        return Solution(
+            poses=solution.poses.flatten(0, 1)[:, None],
+            energies=solution.energies[:, 0, 1:].reshape(-1, 1),
+            valid=solution.valid[:, None].expand_as(ids).reshape(-1, 1),
+            chosen=torch.zeros_like(pairs.reference),
+            cost=solution.cost,
+        )
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:
         solution = self.solve(batch)
@@ -98,18 +112,14 @@ class Evaluation(LightningModule):
             seconds=solution.cost.seconds,
             passes=solution.cost.network_passes,
         )
-        self.count(solved)
+        self.metrics.update(solved)
         if self.journal is not None:
             self.journal.append(solved, self.global_rank)
 
     def result(self) -> dict[str, Any]:
-        """The metrics with the cost: seconds and network passes a pair."""
-        costs, metrics = self.costs.compute(), self.metrics.compute()
-        return {
-            **(without_success_rates(metrics) if self.solver.one_answer else metrics),
-            "seconds_per_pair": costs["seconds"] / costs["pairs"],
-            "network_passes_per_pair": costs["passes"] / costs["pairs"],
-        }
+        """See `PoseMetrics.compute`; of a solver with one answer a pair without success rates."""
+        metrics: dict[str, Any] = self.metrics.compute()
+        return without_success_rates(metrics) if self.solver.one_answer else metrics
 
 
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from lp_framework.errors import UserError
@@ -30,8 +31,6 @@ FOLDER = "unfinished"
 SUBJECT = "evaluation.json"
 # What may change on the way.
 MOVABLE = ("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy", "pictures")
-WHOLE_NUMBERS = ("pair", "object", "chosen")
-DECIMALS = ("rotation", "translation", "answer")
 
 
 class Journal:
@@ -82,7 +81,12 @@ class Journal:
             for number, line in enumerate(file.read_bytes().split(b"\n")):
                 checksum, _, text = line.partition(b" ")
                 if checksum == b"%08x" % zlib.crc32(text):
-                    solved = _solved(json.loads(text))
+                    # Of lists, which NumPy gives the 64 bits that their numbers have.
+                    values: dict[str, Any] = {
+                        name: torch.from_numpy(np.array(value)) if isinstance(value, list) else value
+                        for name, value in json.loads(text).items()
+                    }
+                    solved = SolvedBatch(**values)
                     if solved.pair.ndim != 2:
                         raise UserError(f"{file}: is of an earlier version of lp_framework; remove {self.folder}")
                     yield solved
@@ -164,12 +168,3 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str,
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
     others = {key: value for key, value in subject.items() if key not in ("config", "versions")}
     return {**compared_settings(subject["config"]), **others}
-
-
-def _solved(values: Mapping[str, Any]) -> SolvedBatch:
-    return SolvedBatch(
-        **{name: torch.tensor(values[name], dtype=torch.int64) for name in WHOLE_NUMBERS},
-        **{name: torch.tensor(values[name], dtype=torch.float64) for name in DECIMALS},
-        seconds=values["seconds"],
-        passes=values["passes"],
-    )

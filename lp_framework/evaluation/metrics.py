@@ -17,7 +17,7 @@ STATES = ("pair", "object", "rotation", "translation", "chosen", "answer")
 
 
 class SolvedBatch(NamedTuple):
-    """What is kept of a batch of P pairs from N starts: what `PoseMetrics.update` takes, and what the batch took."""
+    """What is kept of a batch of P pairs from N starts, and what the batch took."""
 
     pair: Tensor  # [P, 2] int64, rows of reference and query in the view table
     object: Tensor  # [P] int64
@@ -88,50 +88,40 @@ class PoseMetrics(HostMetric):
     `names`, `ambiguities` and `unique_answer` describe the objects by index; `unique_answer` is None where unknown.
     """
 
-    pair: list[Tensor]
-    object: list[Tensor]
-    rotation: list[Tensor]
-    translation: list[Tensor]
-    chosen: list[Tensor]
-    answer: list[Tensor]
+    batch: list[Tensor]  # the first pair of each
+    cost: list[Tensor]  # pairs, seconds, passes of each batch
 
     def __init__(
         self, names: Sequence[str], ambiguities: Sequence[str], unique_answer: Sequence[bool | None], **arguments: Any
     ) -> None:
         super().__init__(**arguments)
         self.names, self.ambiguities, self.unique_answer = list(names), list(ambiguities), list(unique_answer)
-        for state in STATES:
+        for state in (*STATES, "batch", "cost"):
             self.add_state(state, [], dist_reduce_fx="cat")
-        self._all_rows: dict[str, Tensor] | None = None
+        self._rows: dict[str, Tensor] = {}
 
-    def update(
-        self, pair: Tensor, object: Tensor, rotation: Tensor, translation: Tensor, chosen: Tensor, answer: Tensor
-    ) -> None:
-        """Add pairs `[P, 2]` (rows of views) of objects `[P]`: errors `[P, N]` (degrees, scene units), chosen start
-        `[P]` and its relative pose `[P, 3]`.
-        """
-        for state, value in zip(STATES, (pair, object, rotation, translation, chosen, answer), strict=True):
-            getattr(self, state).append(value)
-        self._all_rows = None
-
-    def reset(self) -> None:
-        super().reset()
-        self._all_rows = None
+    def update(self, solved: SolvedBatch) -> None:
+        """Add the pairs of a batch."""
+        for state in STATES:
+            getattr(self, state).append(getattr(solved, state))
+        self.batch.append(solved.pair[:1])
+        self.cost.append(torch.tensor([[len(solved.pair), solved.seconds, solved.passes]], dtype=torch.float64))
 
     def rows(self) -> dict[str, Tensor]:
-        """One row a pair, by ascending reference and query, each pair once; of all processes once `compute` has run."""
-        return self._gathered() if self._all_rows is None else self._all_rows
-
-    def _gathered(self) -> dict[str, Tensor]:
-        rows = {state: dim_zero_cat(getattr(self, state)) for state in STATES}
-        order = first_of_each(rows["pair"])
-        return {state: value[order] for state, value in rows.items()}
+        """One row a pair, of all processes, by ascending reference and query, each pair once."""
+        self.compute()  # which is kept until the next update
+        return self._rows
 
     def compute(self) -> dict[str, Any]:
         """`metrics`, `metrics_unique_answer` (None where no object is labelled so), `per_object`, `per_ambiguity`,
-        `unanswered` (the share of pairs for which the solver had no answer), `pairs`."""
+        `unanswered` (the share of pairs for which the solver had no answer), `pairs`, `seconds_per_pair` and
+        `network_passes_per_pair`."""
         # Here, and only here, torchmetrics has the states of all processes together.
-        self._all_rows = rows = self._gathered()
+        gathered = {state: dim_zero_cat(getattr(self, state)) for state in STATES}
+        order = first_of_each(gathered["pair"])
+        self._rows = rows = {state: value[order] for state, value in gathered.items()}
+        # However many processes have met a batch, it counts once.
+        cost = dim_zero_cat(self.cost)[first_of_each(dim_zero_cat(self.batch))].sum(dim=0)
 
         def over(chosen: Tensor) -> dict[str, float] | None:
             if not len(chosen):
@@ -153,27 +143,6 @@ class PoseMetrics(HostMetric):
             },
             "unanswered": rows["rotation"].gather(1, rows["chosen"][:, None]).isnan().double().mean().item(),
             "pairs": len(rows["pair"]),
+            "seconds_per_pair": (cost[1] / cost[0]).item(),
+            "network_passes_per_pair": (cost[2] / cost[0]).item(),
         }
-
-
-class Costs(HostMetric):
-    """Pairs, seconds and network passes of batches that count once each, however many processes met one."""
-
-    batch: list[Tensor]
-    cost: list[Tensor]
-
-    def __init__(self, **arguments: Any) -> None:
-        super().__init__(**arguments)
-        self.add_state("batch", [], dist_reduce_fx="cat")  # its first pair
-        self.add_state("cost", [], dist_reduce_fx="cat")  # pairs, seconds, passes
-
-    def update(self, pair: Tensor, seconds: float, passes: int) -> None:
-        """Add a batch of pairs `[P, 2]`."""
-        self.batch.append(pair[:1])
-        self.cost.append(torch.tensor([[len(pair), seconds, passes]], dtype=torch.float64))
-
-    def compute(self) -> dict[str, float]:
-        """Their sums: `pairs`, `seconds`, `passes`."""
-        batch, cost = dim_zero_cat(self.batch), dim_zero_cat(self.cost)
-        pairs, seconds, passes = cost[first_of_each(batch)].sum(dim=0).tolist()
-        return {"pairs": pairs, "seconds": seconds, "passes": passes}

@@ -73,14 +73,10 @@ def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) 
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
     table.add_column("", no_wrap=True)
     order = []
-    for all_starts in (False, True):
-        prefix = "SR" if all_starts else "R"
+    for prefix in ("R", "SR"):
         for degrees in ROTATION_THRESHOLDS:
-            for name, label in (
-                (f"{prefix}@{degrees}", f"@{degrees}\n{prefix}"),
-                (f"{prefix}(R)@{degrees}", f"\n{prefix}(R)"),
-            ):
-                order.append(name)
+            order += [f"{prefix}@{degrees}", f"{prefix}(R)@{degrees}"]
+            for label in (f"@{degrees}\n{prefix}", f"\n{prefix}(R)"):
                 table.add_column(label, justify="right", min_width=5, no_wrap=True)
     table.add_column("Rot.\n(deg)", justify="right", min_width=6)
     table.add_column("Trans.", justify="right", min_width=6)

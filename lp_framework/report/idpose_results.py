@@ -22,7 +22,7 @@ from torch import Tensor
 
 from lp_framework.data.sets.omni3d import RADIUS, omni3d_cameras, omni3d_objects
 from lp_framework.errors import UserError
-from lp_framework.evaluation.metrics import PoseMetrics
+from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch
 from lp_framework.evaluation.tables import summary_rows, terminal_table
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error, translation_error, view_pose
 
@@ -95,12 +95,16 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
     predicted = camera_to_world(apply_relative_pose(view_pose(reference), poses))
     metrics = PoseMetrics(names, ["unlabelled"] * len(names), [None] * len(names))
     metrics.update(
-        torch.arange(len(pairs)),
-        torch.tensor([names.index(pair.object) for pair in pairs]),
-        rotation_error(predicted, query)[:, None],
-        translation_error(predicted, query)[:, None],
-        torch.zeros(len(pairs), dtype=torch.int64),
-        poses,
+        SolvedBatch(
+            pair=torch.arange(len(pairs)),
+            object=torch.tensor([names.index(pair.object) for pair in pairs]),
+            rotation=rotation_error(predicted, query)[:, None],
+            translation=translation_error(predicted, query)[:, None],
+            chosen=torch.zeros(len(pairs), dtype=torch.int64),
+            answer=poses,
+            seconds=0.0,
+            passes=0,
+        )
     )
     result: dict[str, Any] = metrics.compute()
     return result
