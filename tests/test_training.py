@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tiny_runs import Commands, Ran
 
 from lp_framework.errors import UserError
@@ -281,6 +282,17 @@ def test_a_resumed_run_keeps_its_settings(commands, score):
     ran = commands.here("changed", "train", "resume=score", "model.hidden=32")
     assert ran.error == (
         f"model.hidden cannot be changed by a resumed run: {Path('score/config.yaml')} says what it is; leave it out"
+    )
+
+
+def test_a_run_that_held_out_other_views_is_not_resumed(commands, score):
+    folder = shutil.copytree(score.folder, commands.folder / "earlier")
+    saved = OmegaConf.load(folder / "config.yaml")
+    del saved.data["validation_objects"]  # which came with the views that are held out now
+    OmegaConf.save(saved, folder / "config.yaml")
+    assert commands.here("onwards", "train", "resume=earlier", "trainer.max_epochs=4").error == (
+        "resume=earlier: was begun by an earlier version of lp_framework, which held out other views for validation; "
+        "train anew"
     )
 
 

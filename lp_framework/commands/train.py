@@ -101,7 +101,13 @@ def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -
     saved = folder / "config.yaml"
     if not saved.is_file() or not _has_begun(folder):
         raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
-    return with_overrides(_saved_config(saved, config), config, overrides, ("trainer",), saved)
+    before = _saved_config(saved, config)
+    if before.data.get("validation_views") and "validation_objects" not in before.data:
+        raise UserError(
+            f"resume={folder}: was begun by an earlier version of lp_framework, which held out other views for "
+            "validation; train anew"
+        )
+    return with_overrides(before, config, overrides, ("trainer",), saved)
 
 
 def _has_begun(folder: Path) -> bool:
