@@ -262,8 +262,8 @@ def process(tmp_path: Path, fill_body: str) -> subprocess.Popen:
 
 @pytest.mark.heavy
 def test_processes_that_want_the_same_array_fill_it_once(tmp_path, array, fill):
-    running = [process(tmp_path, "time.sleep(0.5)") for _ in range(3)]
-    assert [float(each.communicate(timeout=60)[0]) for each in running] == [TRUTH.sum()] * 3
+    running = [process(tmp_path, "time.sleep(0.5)") for _ in range(2)]
+    assert [float(each.communicate(timeout=60)[0]) for each in running] == [TRUTH.sum()] * 2
     assert (tmp_path / "fills").read_text() == "x"
     np.testing.assert_array_equal(array(), TRUTH)
     assert fill.calls == 0

@@ -14,24 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from lp_framework.data.cache import (
-    cached_array,
-    content_key,
-    decoded_alpha,
-    decoded_depths,
-    decoded_views,
-    tracked,
-)
-from lp_framework.data.pairs import (
-    BlockSampler,
-    ListSampler,
-    PairBatch,
-    PairData,
-    Rows,
-    ViewTable,
-    as_images,
-    in_batches,
-)
+from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views, tracked
+from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
 from lp_framework.data.source import ViewSource
 from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError, check_settings
@@ -251,7 +235,7 @@ class PairDataModule(LightningDataModule):
         return self._listed(data, batches)
 
     def _listed(self, data: PairData, batches: Sequence[NDArray[np.int64]]) -> DataLoader[PairBatch]:
-        return DataLoader(data, batch_size=None, sampler=ListSampler(batches, *self._ranks()))
+        return DataLoader(data, batch_size=None, sampler=share_out(batches, *self._ranks()))
 
 
 def _folder(split: str) -> str:

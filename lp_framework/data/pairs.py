@@ -107,9 +107,8 @@ class ViewTable:
         views of an object (iFusion's script, which takes training views).
         """
         if protocol not in PROTOCOLS:
-            raise UserError(
-                f"protocol='{protocol}' is not known{nearest(protocol, PROTOCOLS)} (known: {', '.join(PROTOCOLS)})"
-            )
+            known = f"{nearest(protocol, PROTOCOLS)} (known: {', '.join(PROTOCOLS)})"
+            raise UserError(f"protocol='{protocol}' is not known{known}")
         chosen = []
         for index, name in enumerate(self.names):
             views = self.views_of(index)
@@ -119,16 +118,13 @@ class ViewTable:
                 random = np.random.default_rng([seed, stable_id(name)])  # whatever else the table holds
                 others = [random.choice(views[views != query]) for query in views]
                 chosen.append(np.stack([np.array(others), views], axis=1))
-                continue
-            chosen.append(_within(views[:5] if protocol == "ifusion" else views))
+            else:
+                chosen.append(_within(views[:5] if protocol == "ifusion" else views))
         return np.concatenate(chosen)
 
     def view_sets(self, views: int) -> NDArray[np.int64]:
         """Sets of `views` images of an object each, `[S, V]`: every view once as the first, followed by the next ones
-        in the table's order, the object's first again after its last.
-
-        So every view is once the first, second, ... of a set, and no two sets share a first view.
-        """
+        in the table's order, the object's first again after its last."""
         chosen = []
         for index, name in enumerate(self.names):
             own = self.views_of(index)
@@ -209,10 +205,9 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
     def __init__(
         self, table: ViewTable, batch_pairs: int, block: int, seed: int, rank: int = 0, ranks: int = 1
     ) -> None:
-        if alone := [name for name, count in zip(table.names, table.counts, strict=True) if count < 2]:
-            raise UserError(f"object '{alone[0]}' has 1 view to train on; a pair needs two")
-        self.table, self.block, self.seed = table, block, seed
-        self.rank, self.ranks = rank, ranks
+        if 1 in table.counts:
+            raise UserError(f"object '{table.names[table.counts.index(1)]}' has 1 view to train on; a pair needs two")
+        self.table, self.block, self.seed, self.rank, self.ranks = table, block, seed, rank, ranks
         self.units_per_batch = max(1, round(batch_pairs / (2 * block * block)))
         self.epoch = 0
 
@@ -267,19 +262,8 @@ def in_batches(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
     return [pairs[start : start + count] for start in range(0, len(pairs), count)]
 
 
-class ListSampler(Sampler[NDArray[np.int64]]):
-    """Given batches of pairs `[P, 2]` in order, shared out over processes.
-
-    Processes get equally many; where the number does not divide, the last ones repeat earlier batches, and the metrics
-    count a pair once.
-    """
-
-    def __init__(self, batches: Sequence[NDArray[np.int64]], rank: int = 0, ranks: int = 1) -> None:
-        rounds = -(-len(batches) // ranks)
-        self.batches = [batches[(step * ranks + rank) % len(batches)] for step in range(rounds)]
-
-    def __len__(self) -> int:
-        return len(self.batches)
-
-    def __iter__(self) -> Iterator[NDArray[np.int64]]:
-        return iter(self.batches)
+def share_out(batches: Sequence[NDArray[np.int64]], rank: int = 0, ranks: int = 1) -> list[NDArray[np.int64]]:
+    """The batches of one of several processes, which get equally many: where the number does not divide, the last ones
+    repeat earlier batches, and the metrics count a pair once."""
+    rounds = -(-len(batches) // ranks)
+    return [batches[(step * ranks + rank) % len(batches)] for step in range(rounds)]
