@@ -1,15 +1,14 @@
 """Meshes: loading any file that trimesh reads, normalising it, and the surfaces that the renderers draw.
 
 A scene is normalised when the centre of its bounding box is the origin and the longest side of the box is 1 (the
-paper, Dataset Construction). What both renderers need of a scene, down to the normals, is worked out here, once.
+paper, Dataset Construction).
 """
 
 from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,6 +21,7 @@ from scipy.sparse import coo_array
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from lp_framework.data.reading import expecting
 from lp_framework.errors import UserError
 
 Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
@@ -79,10 +79,9 @@ def load_scene(path: str | Path) -> trimesh.Scene:
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
-    with loading(path):
+    with expecting(f"{path}: does not load as a mesh"):
         scene = normalise(trimesh.load_scene(str(path)))
-    plain = sum(not _has_colour(mesh) for mesh in scene.geometry.values())
-    if plain:
+    if plain := sum(not _has_colour(mesh) for mesh in scene.geometry.values()):
         warnings.warn(
             f"{path}: {plain} of {len(scene.geometry)} meshes have no texture or colour; they are drawn in light grey",
             stacklevel=2,
@@ -90,36 +89,29 @@ def load_scene(path: str | Path) -> trimesh.Scene:
     return scene
 
 
-@contextmanager
-def loading(path: Path, what: str = "a mesh") -> Iterator[None]:
-    """Make a `UserError` that names the file of whatever trimesh raises while it reads one."""
-    try:
-        yield
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    except Exception as error:  # its parsers raise anything from KeyError to struct.error
-        raise UserError(f"{path}: does not load as {what} ({type(error).__name__}: {error})") from error
-
-
 def normalise(scene: trimesh.Scene) -> trimesh.Scene:
     """A copy with the bounding box centred at the origin and its longest side 1, all transforms applied.
 
-    What is not a mesh with faces (points, paths) is left out. Raises `UserError` when no faces, no extent or no
+    What is not a mesh with faces (points, paths) is left out. Raises `ValueError` when no faces, no extent or no
     area remain.
     """
-    meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    meshes = _meshes(scene)
     if not meshes:
-        raise UserError("the mesh has no faces")
+        raise ValueError("it has no faces")
     bounds = np.array([mesh.bounds for mesh in meshes])
     lowest, highest = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     side = (highest - lowest).max()
     if not (np.isfinite(side) and side > 0):
-        raise UserError(f"the mesh has no proper extent (the longest side of its bounding box is {side})")
+        raise ValueError(f"it has no proper extent, the longest side of its bounding box is {side}")
     if not any(mesh.area > 0 for mesh in meshes):
-        raise UserError("all faces of the mesh have area 0")
+        raise ValueError("all of its faces have area 0")
     for mesh in meshes:
         mesh.vertices = (mesh.vertices - (lowest + highest) / 2) / side
     return trimesh.Scene(meshes)
+
+
+def _meshes(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
+    return [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
 
 
 def fingerprint(scene: trimesh.Scene) -> str:
@@ -143,12 +135,13 @@ def surfaces(scene: trimesh.Scene) -> list[Surface]:
     included, whatever normals the file has. Metalness, normal maps and transparency are left out. Of triangles that
     coincide, and look the same way, the first is kept: which of them won would be chance.
     """
-    meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    meshes = _meshes(scene)
     mesh_of_triangle = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
     face_of_triangle = np.concatenate([np.arange(len(mesh.faces)) for mesh in meshes])
     points = _weld(np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)).reshape(-1, 3)
     degenerate = (points == np.roll(points, 1, axis=1)).any(axis=1)
-    points = _lowest_first(points)
+    # Each begun at its lowest index and otherwise in the same order.
+    points = points[np.arange(len(points))[:, None], (points.argmin(axis=1)[:, None] + np.arange(3)) % 3]
     kept = np.sort(np.unique(points, axis=0, return_index=True)[1])
     kept = kept[~degenerate[kept]]
     twins = _twins(points[kept])
@@ -158,12 +151,14 @@ def surfaces(scene: trimesh.Scene) -> list[Surface]:
 
 def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.int64]) -> Surface:
     corners = mesh.faces[faces].reshape(-1)
-    image = _image(mesh)
+    image, colour = _image(mesh), _factor(mesh)
+    if colour is None:
+        colour = np.full(3, 1.0 if _has_colour(mesh) else NEUTRAL_GREY)
     return Surface(
         positions=mesh.vertices[corners].astype(np.float32),
         normals=_corner_normals(mesh.triangles[faces]),
         twins=twins,
-        colour=_material_colour(mesh),
+        colour=colour.astype(np.float32),
         corner_colours=_corner_colours(mesh, faces),
         texture=None if image is None else _texture(image),
         texture_coordinates=None if image is None else np.asarray(mesh.visual.uv, np.float32)[corners],  # type: ignore
@@ -174,11 +169,6 @@ def _weld(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Indices `[n]` that are equal for the points `[n, 3]` that coincide."""
     scale = 1e-6 * max(float(np.ptp(points, axis=0).max()), np.finfo(float).tiny)
     return np.unique(np.round(points / scale).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
-
-
-def _lowest_first(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles `[T, 3]` of point indices, each begun at its lowest index and otherwise in the same order."""
-    return triangles[np.arange(len(triangles))[:, None], (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3]
 
 
 def _twins(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -236,13 +226,6 @@ def _factor(mesh: trimesh.Trimesh) -> NDArray[np.floating] | None:
         ):
             return srgb_to_linear(np.asarray(diffuse, float)[:3] / 255)
     return None
-
-
-def _material_colour(mesh: trimesh.Trimesh) -> NDArray[np.float32]:
-    factor = _factor(mesh)
-    if factor is None:
-        factor = np.full(3, 1.0 if _has_colour(mesh) else NEUTRAL_GREY)
-    return factor.astype(np.float32)
 
 
 def _corner_colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[np.float32] | None:

@@ -33,12 +33,12 @@ def read_json(file: Path) -> Any:
 
 @contextmanager
 def expecting(sentence: str) -> Iterator[None]:
-    """Make `UserError`, with what `sentence` says is wanted, of what goes wrong in taking some content apart."""
+    """Make `UserError`, with what `sentence` says is wanted, of what goes wrong in reading or taking apart."""
     try:
         yield
     except UserError:
         raise
-    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+    except Exception as error:  # parsers raise anything from KeyError to struct.error
         raise UserError(f"{sentence} ({type(error).__name__}: {error})") from error
 
 

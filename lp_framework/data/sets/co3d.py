@@ -27,7 +27,6 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.data.meshes import loading
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.reading import expecting, names_below, numbers, read_json
 from lp_framework.data.real_cameras import from_pytorch3d, ndc_intrinsics
@@ -203,7 +202,7 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
 
 def read_points(file: Path) -> Tensor:
     """The points `[P, 3]` (float64) of a PLY file; `UserError` naming it where it does not load or has fewer than 3."""
-    with loading(file, "a point cloud"):
+    with expecting(f"{file}: does not load as a point cloud"):
         loaded: Any = trimesh.load(file, process=False)
         points = np.asarray(loaded.vertices, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():

@@ -16,8 +16,8 @@ import numpy as np
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
-from lp_framework.data.meshes import MeshObject, load_scene, loading, normalise
-from lp_framework.data.reading import names_below
+from lp_framework.data.meshes import MeshObject, load_scene, normalise
+from lp_framework.data.reading import expecting, names_below
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.sets.object_lists import ObjectLists, drawn, kept_lists
 from lp_framework.data.sets.rendered import RenderedData
@@ -131,7 +131,7 @@ def load_gso(path: Path) -> trimesh.Scene:
     for file in (path, texture):
         if not file.is_file():
             raise UserError(f"{file}: there is no such file; an object of GSO needs it")
-    with loading(path), path.open("rb") as opened:
+    with expecting(f"{path}: does not load as a mesh"), path.open("rb") as opened:
         scene = trimesh.load_scene(opened, file_type="obj", resolver=_GSOFiles(path, texture))
         scene.apply_transform(_Z_UP_TO_Y_UP)
         return normalise(scene)
