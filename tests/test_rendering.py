@@ -391,7 +391,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_written_views_have_ifusions_layout(tmp_path):
     protocol = ViewProtocol(resolution=32, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)
-    assert render_object(*objects_named("cube"), tmp_path, protocol, RaycastRenderer())
+    render_object(*objects_named("cube"), tmp_path, protocol, RaycastRenderer())
     for split, poses in (("train", protocol.training_poses("cube")), ("test", protocol.test_poses("cube"))):
         folder = tmp_path / "cube" / split
         transform = json.loads((folder / "transform.json").read_text())
@@ -504,7 +504,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
     other = MeshObject("cube", "unique", lambda: trimesh.Scene(vertex_coloured_torus()))
     with pytest.raises(UserError, match=r"rendered differently.*mesh was"):
         render_object(other, tmp_path, SMALL, FlatRenderer())
-    assert not render_object(obj, tmp_path, SMALL, FlatRenderer())
+    render_object(obj, tmp_path, SMALL, FlatRenderer(fails_at=0))
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):

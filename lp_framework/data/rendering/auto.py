@@ -31,5 +31,4 @@ class AutoRenderer(Renderer):
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> Iterator[View]:
-        """See `Renderer.views`."""
         return self.chosen.views(scene, camera_to_world, resolution, field_of_view_degrees)

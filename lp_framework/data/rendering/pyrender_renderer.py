@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
@@ -37,7 +37,6 @@ class PyrenderRenderer(Renderer):
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> Iterator[View]:
-        """See `Renderer.views`."""
         context = offscreen_context()
         import pyrender
 
@@ -47,7 +46,8 @@ class PyrenderRenderer(Renderer):
         camera_node = stage.add(camera)
         for light in LIGHTS:
             source = pyrender.DirectionalLight(color=[1.0, 1.0, 1.0], intensity=light.intensity)
-            stage.add(source, pose=_pose_towards(light.towards), parent_node=camera_node)
+            pose = trimesh.geometry.align_vectors([0, 0, 1], light.towards)  # its +Z points towards the light
+            stage.add(source, pose=pose, parent_node=camera_node)
         for pose in np.asarray(camera_to_world, dtype=np.float64):
             stage.set_pose(camera_node, pose)
             context.viewport_width = context.viewport_height = resolution * SUPERSAMPLING
@@ -63,11 +63,12 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
 
     primitives = []
     for surface in parts:
-        texture = None
-        if surface.texture is not None:
-            texture = pyrender.Texture(source=surface.texture, source_channels="RGB")
+        texture, coordinates, colours = surface.texture, surface.texture_coordinates, surface.corner_colours
         material = pyrender.MetallicRoughnessMaterial(
-            baseColorFactor=[*surface.colour, 1.0], baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0
+            baseColorFactor=[*surface.colour, 1.0],
+            baseColorTexture=None if texture is None else pyrender.Texture(source=texture, source_channels="RGB"),
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
         )
         corners = np.arange(len(surface.positions)).reshape(-1, 3)
         turned = corners[surface.twins < 0, ::-1]
@@ -75,17 +76,14 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
             if not len(order):
                 continue
             attributes = [surface.positions[order], sign * surface.normals[order]]
-            if surface.texture_coordinates is not None:
-                attributes.append(surface.texture_coordinates[order])
-            if surface.corner_colours is not None:
-                attributes.append(surface.corner_colours[order])
+            attributes += [each[order] for each in (coordinates, colours) if each is not None]
             shared, index = _shared_corners(np.hstack(attributes))
             primitives.append(
                 pyrender.Primitive(
                     positions=shared[:, :3],
                     normals=shared[:, 3:6],
-                    texcoord_0=None if surface.texture_coordinates is None else shared[:, 6:8],
-                    color_0=None if surface.corner_colours is None else shared[:, -3:],
+                    texcoord_0=None if coordinates is None else shared[:, 6:8],
+                    color_0=None if colours is None else shared[:, -3:],
                     indices=index.reshape(-1, 3),
                     material=material,
                 )
@@ -98,11 +96,6 @@ def _shared_corners(corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], 
     rows = np.ascontiguousarray(corners).view(np.dtype((np.void, corners.itemsize * corners.shape[1]))).reshape(-1)
     _, first, index = np.unique(rows, return_index=True, return_inverse=True)
     return corners[first], index
-
-
-def _pose_towards(towards: tuple[float, float, float]) -> NDArray[np.float64]:
-    """A pose whose +Z axis, against which pyrender's light shines, is the given direction."""
-    return trimesh.geometry.align_vectors([0, 0, 1], towards)
 
 
 # ---------------------------------------------------------------- the context
@@ -132,9 +125,16 @@ def offscreen_context() -> pyrender.OffscreenRenderer:
 
 
 def _open_context() -> pyrender.OffscreenRenderer:
+    """A context without pyrender's own multisampling, of four samples a pixel: we supersample by ourselves, as raycast
+    does, which leaves each sample either opaque or clear; both would take software OpenGL three times as long."""
     import pyrender
 
-    _turn_off_multisampling(pyrender.renderer)
+    allocate = pyrender.renderer.glRenderbufferStorageMultisample
+
+    def single_sampled(target: int, _samples: int, *sizes: int) -> None:
+        allocate(target, 0, *sizes)
+
+    pyrender.renderer.glRenderbufferStorageMultisample = single_sampled
     return pyrender.OffscreenRenderer(64, 64)
 
 
@@ -142,14 +142,3 @@ def _forget_opengl() -> None:
     """PyOpenGL binds to a platform when it is first imported: import it afresh, so that the next one has a chance."""
     for module in [name for name in sys.modules if name.partition(".")[0] in ("OpenGL", "pyrender")]:
         del sys.modules[module]
-
-
-def _turn_off_multisampling(module: Any) -> None:
-    """Four samples a pixel are a fixed number in pyrender. We supersample by ourselves, as raycast does, which
-    leaves each sample either opaque or clear; with both, a view would take software OpenGL three times as long."""
-    allocate = module.glRenderbufferStorageMultisample
-
-    def single_sampled(target: int, _samples: int, format: int, width: int, height: int) -> None:
-        allocate(target, 0, format, width, height)
-
-    module.glRenderbufferStorageMultisample = single_sampled

@@ -30,7 +30,6 @@ class RaycastRenderer(Renderer):
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> Iterator[View]:
-        """See `Renderer.views`."""
         try:
             from trimesh.ray.ray_pyembree import RayMeshIntersector
         except ImportError as error:

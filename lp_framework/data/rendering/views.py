@@ -11,10 +11,11 @@ import os
 import threading
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +48,11 @@ LATER = {"train_views": None, "depth": False}  # settings that records leave out
 
 @dataclass(frozen=True)
 class ViewProtocol:
-    """Where the cameras stand. The training views lie on a grid of latitudes and longitudes (degrees, the latitudes
-    with both ends), each at a random radius (scene units); the test views are random in the same ranges, and so are the
-    training views where their number `train_views` is given. With `depth` the views' depths are kept as well.
+    """Where the cameras stand: by default on 9 latitudes x 24 longitudes, 216 training views, as in the paper.
 
-    With the defaults 9 latitudes x 24 longitudes = 216 training views and 8 test views, as in the paper.
+    The training views lie on a grid of latitudes and longitudes (degrees, the latitudes with both ends), each at a
+    random radius (scene units); the test views are random in the same ranges, and so are the training views where
+    their number `train_views` is given. With `depth` the views' depths are kept as well.
     """
 
     resolution: int = 512
@@ -118,8 +119,8 @@ def _steps(start: float, end: float, step: float) -> NDArray[np.floating]:
 # ---------------------------------------------------------------- one object
 
 
-def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> bool:
-    """Render an object into `<root>/<name>`, whole or not at all; False when it was there already.
+def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> None:
+    """Render an object into `<root>/<name>`, whole or not at all, unless it is there already.
 
     Raises `UserError` when the object does not load, when its folder holds something else than the same object under
     the same protocol, or when it cannot be written; nothing of the object is left then.
@@ -132,13 +133,11 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
     if folder.exists():
         changes = _changes(folder, protocol, mesh=mesh)
         if changes is None:
-            raise UserError(
-                f"{folder} exists and was not rendered by this program (it has no proper {RECORD}); "
-                "choose another folder or delete it"
-            )
+            what = f"was not rendered by this program (it has no proper {RECORD})"
+            raise UserError(f"{folder} exists and {what}; choose another folder or delete it")
         if changes:
             raise UserError(f"{folder} was rendered differently ({changes}); choose another folder or delete this one")
-        return False
+        return
     labels = {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer}
     record = {
         "object": obj.name,
@@ -160,16 +159,17 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
             for name in names:
                 pixels, depth = next(views)
                 Image.fromarray(pixels).save(partial / split / "rgb" / name, compress_level=1)
-                if protocol.depth and depth is None:
-                    raise UserError(f"renderer={renderer.name} knows no depth; set data.depth=false or choose another")
-                if protocol.depth and depth is not None:
+                if protocol.depth:
+                    if depth is None:
+                        raise UserError(
+                            f"renderer={renderer.name} knows no depth; set data.depth=false or choose another"
+                        )
                     levels = np.rint(depth / DEPTH_UNIT).clip(0, 65535).astype(np.uint16)
                     Image.fromarray(levels).save(partial / split / "depth" / name, compress_level=1)
             known = {} if obj.ambiguity == "unlabelled" else labels
             write_transforms(partial / split, transforms["frames"], protocol.field_of_view_degrees, known)
 
     write_object(folder, RECORD, record, write)
-    return True
 
 
 def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str | None:
@@ -197,10 +197,9 @@ def render_objects(
 ) -> None:
     """Render objects into `<root>/<name>`, several at once; finished ones are skipped.
 
-    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them; without it a
-    record of the same protocol is believed.
-    `workers` is the number of processes, by default one a CPU core; 1 renders in this process. Two runs into one
-    folder take turns. A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
+    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them. `workers` is the
+    number of processes, by default one a CPU core; 1 renders in this one. Two runs into one folder take turns.
+    A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
     """
     todo = list(objects)
     names = [obj.name for obj in todo]
@@ -215,8 +214,8 @@ def render_objects(
     workers = min(workers, len(todo))
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
-        work = (root, protocol, renderer)
-        done = _in_processes(todo, workers, *work) if workers > 1 else (_work(obj, *work) for obj in todo)
+        work = partial(_work, root=root, protocol=protocol, renderer=renderer)
+        done = _in_processes(work, todo, workers) if workers > 1 else map(work, todo)
         for name, failure, messages in tracked(done, "rendering", len(todo)):
             for message in messages:
                 warnings.warn(message, stacklevel=2)
@@ -239,19 +238,15 @@ def _work(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: R
     return obj.name, failure, [str(each.message) for each in caught if issubclass(each.category, UserWarning)]
 
 
-def _in_processes(
-    objects: list[MeshObject], workers: int, root: str | Path, protocol: ViewProtocol, renderer: Renderer
-) -> Iterator[Outcome]:
+def _in_processes(work: Callable[[MeshObject], Outcome], objects: list[MeshObject], workers: int) -> Iterator[Outcome]:
     context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
     executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
     try:
-        for future in as_completed([executor.submit(_work, obj, root, protocol, renderer) for obj in objects]):
+        for future in as_completed([executor.submit(work, obj) for obj in objects]):
             yield future.result()
     except BrokenProcessPool as error:
-        raise UserError(
-            "a rendering process was killed, perhaps for lack of memory; the objects finished so far are kept, "
-            "run the same command again with fewer workers"
-        ) from error
+        what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
+        raise UserError(f"{what}, run the same command again with fewer workers") from error
     finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
@@ -264,7 +259,6 @@ def _start_worker() -> None:
 
 def _end_with_parent() -> None:
     """End this process when its parent is killed; left alone it would go on writing, into the next run's folder."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
+    if parent := multiprocessing.parent_process():
         parent.join()
         os._exit(1)
