@@ -119,9 +119,8 @@ class PairDataModule(LightningDataModule):
         if not self.validation_objects:
             return [self._some(each, held_out, left=2) for each in views]
         if self.validation_objects >= len(views):
-            raise UserError(
-                f"data.validation_objects={self.validation_objects} of {len(views)} objects leave none to train on"
-            )
+            count = f"data.validation_objects={self.validation_objects} of {len(views)} objects"
+            raise UserError(f"{count} leave none to train on")
         names = sorted((each.name for each in views), key=lambda name: stable_id(f"{self.seed} {name}"))
         drawn = names[: self.validation_objects]
         chosen = [each for each in views if (each.name in drawn) == held_out]
@@ -131,10 +130,8 @@ class PairDataModule(LightningDataModule):
         """The `validation_views` of an object, or its others, of which at least `left` are wanted."""
         count = self.validation_views
         if len(views) < count + left:
-            raise UserError(
-                f"object '{views.name}' has {len(views)} training views; holding out data.validation_views={count} "
-                f"needs at least {count + left}"
-            )
+            wanted = f"holding out data.validation_views={count} needs at least {count + left}"
+            raise UserError(f"object '{views.name}' has {len(views)} training views; {wanted}")
         order = np.random.default_rng([self.seed, stable_id(views.name)]).permutation(len(views))
         kept = np.sort(order[:count] if held_out else order[count:])
         files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
@@ -224,15 +221,15 @@ class PairDataModule(LightningDataModule):
         """The pairs or sets to evaluate on that were chosen, by default all ordered pairs of the test views."""
         data = self.data(self.evaluation_split())
         if self._views is not None:
-            sets = data.table.view_sets(self._views)
-            pairs = np.stack([np.repeat(sets[:, :1], self._views - 1, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
-            count = max(1, self._evaluation_pairs // (self._views - 1)) * (self._views - 1)
+            sets, others = data.table.view_sets(self._views), self._views - 1
+            pairs = np.stack([np.repeat(sets[:, :1], others, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
+            count = max(1, self._evaluation_pairs // others) * others
         else:
             pairs, count = data.table.pairs(*(self._evaluation or ("ordered", 0))), self._evaluation_pairs
-        batches = [
-            each for each in in_batches(pairs, count) if not self._left_out.issuperset(map(tuple, each.tolist()))
-        ]
-        return self._listed(data, batches)
+        batches = in_batches(pairs, count)
+        return self._listed(
+            data, [each for each in batches if not self._left_out.issuperset(map(tuple, each.tolist()))]
+        )
 
     def _listed(self, data: PairData, batches: Sequence[NDArray[np.int64]]) -> DataLoader[PairBatch]:
         return DataLoader(data, batch_size=None, sampler=share_out(batches, *self._ranks()))

@@ -24,24 +24,20 @@ PROTOCOLS = ("ordered", "per_view", "ifusion")
 class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
-    `pixels` `[I, H, W, 3]` (uint8), or `features` `[I, ...]` that a frozen backbone computed from them; `names` of the
-    views, `object/image`; `poses` `[I, 3]` view poses and `cameras` `[I, 4, 4]`, the truth (float64, always on the
-    CPU); `objects` `[I]`; `reference`, `query` `[P]` into the views; `pairs` `[P, 2]` the same as rows of the view
-    table. Where they are asked for: `alpha` `[I, H, W]` (uint8), and `depth` `[I, H, W]` (float32) along the optical
-    axis in scene units, 0 where there is nothing.
+    `alpha` and `depth` are there where they are asked for.
     """
 
-    pixels: Tensor | None
-    features: Tensor | None
-    names: list[str]
-    poses: Tensor
-    cameras: Tensor
-    objects: Tensor
-    reference: Tensor
-    query: Tensor
-    pairs: Tensor
-    alpha: Tensor | None = None
-    depth: Tensor | None = None
+    pixels: Tensor | None  # [I, H, W, 3] (uint8), or ...
+    features: Tensor | None  # ... [I, ...] that a frozen backbone computed from them
+    names: list[str]  # of the views, object/image
+    poses: Tensor  # [I, 3], view poses, and ...
+    cameras: Tensor  # ... [I, 4, 4], the truth: float64, always on the CPU
+    objects: Tensor  # [I]
+    reference: Tensor  # [P], into the views
+    query: Tensor  # [P]
+    pairs: Tensor  # [P, 2], the same as rows of the view table
+    alpha: Tensor | None = None  # [I, H, W] (uint8)
+    depth: Tensor | None = None  # [I, H, W] (float32) along the optical axis in scene units, 0 where there is nothing
     relative: Tensor | None = None  # see `relative_poses`, once the batch has gone to a device
 
     def __len__(self) -> int:
@@ -62,9 +58,9 @@ class PairBatch:
 
     def relative_poses(self) -> Tensor:
         """True relative poses `[P, 3]`, float32, where the pairs are."""
-        if self.relative is not None:
-            return self.relative
-        return relative_pose(self.poses[self.reference], self.poses[self.query]).float()
+        if self.relative is None:
+            return relative_pose(self.poses[self.reference], self.poses[self.query]).float()
+        return self.relative
 
     def to(self, device: torch.device) -> PairBatch:
         """The batch on a device, but for the truth: `poses` and `cameras` are float64, which not every device has."""
@@ -215,12 +211,9 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
         """Lightning calls this at the start of every epoch."""
         self.epoch = epoch
 
-    def _units(self, count: int) -> int:
-        blocks = -(-count // self.block)
-        return max(1, blocks * (blocks - 1) // 2)
-
     def __len__(self) -> int:
-        units = sum(self._units(count) for count in self.table.counts)
+        blocks = [-(-count // self.block) for count in self.table.counts]
+        units = sum(max(1, each * (each - 1) // 2) for each in blocks)
         return -(-units // self.units_per_batch // self.ranks)
 
     def __iter__(self) -> Iterator[NDArray[np.int64]]:
@@ -241,19 +234,19 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
         units = []
         for i in range(len(blocks)):
             for j in range(i):
+                across = _product(blocks[i], blocks[j])
                 # Each block's own pairs ride with exactly one unit: (i, i - 1) carries block i, (1, 0) also block 0.
                 extra = ([own[i]] if j == i - 1 else []) + ([own[0]] if (i, j) == (1, 0) else [])
-                units.append(np.concatenate([_across(blocks[i], blocks[j]), *extra]))
+                units.append(np.concatenate([across, across[:, ::-1], *extra]))
         return units
 
 
-def _across(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    first, second = (grid.ravel() for grid in np.meshgrid(a, b, indexing="ij"))
-    return np.concatenate([np.stack([first, second], axis=1), np.stack([second, first], axis=1)])
+def _product(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _within(views: NDArray[np.int64]) -> NDArray[np.int64]:
-    pairs = np.stack(np.meshgrid(views, views, indexing="ij"), axis=-1).reshape(-1, 2)
+    pairs = _product(views, views)
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 

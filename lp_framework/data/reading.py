@@ -69,7 +69,5 @@ def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:
         raise UserError(f"{where} must stand off the origin; its distance is {camera[:3, 3].norm():g}")
     residual = spherical_residual(camera).item()
     if not residual <= LARGEST_RESIDUAL:
-        raise UserError(
-            f"{where} does not look at the origin with {up} up (it is {residual:.1f} degrees off, "
-            f"{LARGEST_RESIDUAL:g} are allowed)"
-        )
+        off = f"it is {residual:.1f} degrees off, {LARGEST_RESIDUAL:g} are allowed"
+        raise UserError(f"{where} does not look at the origin with {up} up ({off})")

@@ -6,12 +6,12 @@ corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). It sta
 
 1. *Virtual turn.* Turning a camera about its own centre changes the image by a homography, exactly. So the camera is
    turned to look at the origin with +Y up: it is then spherical, at the latitude, longitude and distance of the real
-   one. What is left of `spherical_residual` is rounding.
+   one.
 2. *Crop.* The homography also chooses the field of view of the square crop. It is the one in which the object's centre
    plane looks as large as it does to a camera of the priors' field of view F at the *effective radius* r:
    tan(crop / 2) = r / distance * tan(F / 2). Any r could be had; `effective_radii` says which are taken.
 3. *Residual.* The crop is not that camera's image: seen from another distance, near parts look larger or smaller.
-   `perspective_residual` is that difference, the only one there is.
+   `perspective_residual` is that difference.
 """
 
 from __future__ import annotations
@@ -22,22 +22,12 @@ import torch
 from torch import Tensor
 
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
-from lp_framework.geometry import camera_to_world, from_opencv, geodesic_angle, inverse, rigid_transform, view_pose
+from lp_framework.geometry import camera_to_world, geodesic_angle, inverse, rigid_transform, view_pose
 
 NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
 
 
 # ---------------------------------------------------------------- other conventions
-
-
-def from_opencv_view(world_to_camera: Tensor) -> Tensor:
-    """Camera to world `[..., 4, 4]` with OpenGL axes of a world-to-camera matrix with OpenCV's (x right, y down, z
-    forward), as COLMAP and BOP have them.
-
-    >>> from_opencv_view(rigid_transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0])))[:3, 3]  # the origin is 2 ahead
-    tensor([-0., -0., -2.])
-    """
-    return from_opencv(inverse(world_to_camera))
 
 
 def from_pytorch3d(rotation: Tensor, translation: Tensor) -> Tensor:

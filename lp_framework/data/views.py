@@ -56,12 +56,9 @@ class ObjectViews:
 def object_names(root: str | Path) -> list[str]:
     """Names of the objects below `root`, sorted; an object is a folder with a `train` or a `test` folder."""
     root = Path(root)
-    names = (folder.name for folder in root.glob("*") if _is_object(folder))
+    folders = (split.parent for split in root.glob("*/*") if split.name in ("train", "test") and split.is_dir())
+    names = (folder.name for folder in folders if not folder.name.startswith("."))
     return names_below(root, names, "views", f"{root}/OBJECT/train/{TRANSFORMS} and rgb/*.png beside it")
-
-
-def _is_object(folder: Path) -> bool:
-    return not folder.name.startswith(".") and any((folder / split).is_dir() for split in ("train", "test"))
 
 
 def read_views(root: str | Path, name: str, split: str) -> ObjectViews:

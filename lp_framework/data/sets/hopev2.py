@@ -25,11 +25,11 @@ from torch import Tensor
 
 from lp_framework.data.photographs import opened
 from lp_framework.data.reading import expecting, numbers, read_json
-from lp_framework.data.real_cameras import from_opencv_view, normalised, z_up_to_y_up
+from lp_framework.data.real_cameras import normalised, z_up_to_y_up
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.data.sets.object_lists import ObjectLists, kept_lists
 from lp_framework.errors import UserError
-from lp_framework.geometry import is_rotation, rigid_transform
+from lp_framework.geometry import from_opencv, inverse, is_rotation, rigid_transform
 from lp_framework.registry import register
 
 ANNOTATIONS = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
@@ -116,7 +116,7 @@ class HOPEv2Data(PhotographedData):
         mask = scene / "mask_visib" / f"{image:06d}_{instance.place:06d}.png"
         if not mask.is_file():
             raise UserError(f"{mask}: there is no such mask")
-        camera = from_opencv_view(rigid_transform(rotation, translation))
+        camera = from_opencv(inverse(rigid_transform(rotation, translation)))
         camera = z_up_to_y_up(normalised(camera, box.centre, box.sides.max()))
         with opened(file) as photograph:
             return Photograph(file, mask, camera, intrinsics + half, photograph.size)

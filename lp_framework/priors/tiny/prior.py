@@ -46,7 +46,6 @@ class TinyPrior(Prior):
         return ViewCode(latents[..., None, None], codes[:, None])
 
     def residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
-        """See `Prior.residual`."""
         self.check(target, source, pose, timestep, noise)
         alpha = self.model.alphas_cumprod[timestep][:, None]
         noise = noise.flatten(1)
@@ -64,10 +63,10 @@ class TinyPrior(Prior):
         generator: torch.Generator | None = None,
         eta: float = 1.0,
     ) -> Tensor:
-        """See `Prior.generate`. Without a source the prediction is the Gaussian of all training views."""
         if not guidance >= 0:
             raise UserError(f"guidance must not be negative, got {guidance}")
         networks, alphas = self.model.networks, self.model.alphas_cumprod
+        # Without a source the prediction is the Gaussian of all training views.
         predicted, anything = networks.predict(source.embedding[:, 0], pose.float()), networks.marginal()
 
         def predict(latent: Tensor, timestep: int) -> Tensor:

@@ -45,24 +45,21 @@ class EnergyAndSlope(torch.autograd.Function):
     """Energies `[B]` of poses `[B, 3]` whose gradient is computed at once, chunk by chunk.
 
     Each energy depends on its own pose alone, so its gradient is a row `[3]`, kept in the place of the network's
-    activations. Differentiable once; for more use the residual.
+    activations; `both` computes the two of a chunk. Differentiable once; for more use the residual.
     """
 
     @staticmethod
     def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
-        """Energies and their gradients, which `both` computes of a chunk."""
         energies, slopes = zip(*chunks.run(both, len(pose)), strict=True)
         return torch.cat(energies), torch.cat(slopes)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        """Keeps the gradients."""
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(output[1])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, None, None]:
-        """The chain rule, a row each."""
         (slopes,) = ctx.saved_tensors
         return grad[:, None] * slopes, None, None

@@ -192,7 +192,7 @@ class Zero123Prior(Prior):
         generator: torch.Generator | None = None,
         eta: float = 1.0,
     ) -> Tensor:
-        """See `Prior.generate`; the defaults are those of Zero123's and iFusion's published code."""
+        # The defaults are those of Zero123's and iFusion's published code.
         start = standard_normal(pose.new_empty(len(pose), *self.latent_shape), generator)
         latent = self.sample(source, pose, start, steps, guidance, generator, eta)
         return self.decode(latent / SCALE).clamp(-1, 1)
