@@ -23,8 +23,7 @@ from torch import Tensor
 import lp_framework
 from lp_framework.models.checkpoints import SHIPPED, load_model, read_checkpoint
 from lp_framework.priors.zero123.original import read_original
-from lp_framework.priors.zero123.stored_tensor import read_safetensors
-from lp_framework.priors.zero123.torch_file import read_state_dict
+from lp_framework.priors.zero123.tensor_files import read_safetensors, read_state_dict
 
 FUZZ = settings(
     max_examples=100,

@@ -23,11 +23,10 @@ from zero123_checkpoint import manifest, state_dict, write_checkpoint
 
 from lp_framework import registry
 from lp_framework.errors import UserError
-from lp_framework.priors.zero123.folders import PROJECTIONS, read_folder, write_folder
 from lp_framework.priors.zero123.networks import Networks, assemble
 from lp_framework.priors.zero123.original import read_original
-from lp_framework.priors.zero123.torch_file import read_state_dict
-from lp_framework.priors.zero123.weights import download, load_networks
+from lp_framework.priors.zero123.tensor_files import read_state_dict
+from lp_framework.priors.zero123.weights import PROJECTIONS, download, load_networks, read_folder, write_folder
 
 ROOT = Path(__file__).parents[1]
 
@@ -426,7 +425,7 @@ def test_writing_is_all_or_nothing(networks, folder, tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("lp_framework.priors.zero123.folders.save_file", full)
+    monkeypatch.setattr("lp_framework.priors.zero123.weights.save_file", full)
     with pytest.raises(UserError, match=r"cannot be written: .*No space left"):
         write_folder(networks, tmp_path / "new")
     assert list(tmp_path.iterdir()) == []

@@ -12,9 +12,8 @@ import torch
 from lp_framework.benchmarks.harness import Section, worth
 from lp_framework.benchmarks.original_layout import original_tensors
 from lp_framework.benchmarks.zero123 import Architecture, Computing
-from lp_framework.priors.zero123.folders import write_folder
 from lp_framework.priors.zero123.networks import DTYPES, Dtype
-from lp_framework.priors.zero123.weights import load_networks
+from lp_framework.priors.zero123.weights import load_networks, write_folder
 
 CONTENDERS = "checkpoint: loading Zero123", ("converted folder", "original file")
 

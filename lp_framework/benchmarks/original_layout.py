@@ -8,16 +8,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lp_framework.priors.zero123 import original
 from lp_framework.priors.zero123.networks import Networks
-from lp_framework.priors.zero123.original import EMA, PROJECTION, UNET, VAE, VISUAL
-from lp_framework.priors.zero123.original_names import clip_modules, renamed, unet_modules, vae_modules
+from lp_framework.priors.zero123.original import EMA, PROJECTION, UNET, VAE, VISUAL, renamed
 
 
 def original_tensors(networks: Networks) -> dict[str, Tensor]:
     """The tensors by the names and in the shapes of the training code, the U-Net's also as its moving averages."""
-    unet = _renamed(networks.unet, unet_modules(networks.unet.config))
-    vae = _renamed(networks.vae, vae_modules(networks.vae.config))
-    clip = _renamed(networks.image_encoder, clip_modules(networks.image_encoder.config.to_dict()))
+    unet = _renamed(networks.unet, original.unet_modules(networks.unet.config))
+    vae = _renamed(networks.vae, original.vae_modules(networks.vae.config))
+    clip = _renamed(networks.image_encoder, original.clip_modules(networks.image_encoder.config.to_dict()))
     for key in [key for key in vae if ".attn_1." in key and vae[key].ndim == 2]:  # matrices as 1 x 1 convolutions
         vae[key] = vae[key][:, :, None, None]
     for key in [key for key in clip if ".q_proj." in key]:  # queries, keys and values as one tensor

@@ -9,10 +9,9 @@ from omegaconf import DictConfig
 
 from lp_framework.errors import UserError, nearest
 from lp_framework.models.checkpoints import FOLDER, find_checkpoint, read_checkpoint, write_model_folder
-from lp_framework.priors.zero123.folders import write_folder
 from lp_framework.priors.zero123.networks import DTYPES, Dtype
 from lp_framework.priors.zero123.original import Averages
-from lp_framework.priors.zero123.weights import load_networks
+from lp_framework.priors.zero123.weights import load_networks, write_folder
 
 
 def run(config: DictConfig) -> None:

@@ -7,7 +7,6 @@ roughness 1, and OpenGL's trilinear texture filter.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -80,7 +79,7 @@ class _Part:
         area = np.maximum((self.normal**2).sum(axis=1, keepdims=True), np.finfo(float).tiny)
         self.gradient1 = np.cross(edge2, self.normal) / area
         self.gradient2 = np.cross(self.normal, edge1) / area
-        self.mips = None if surface.texture is None else _Mips.of(surface.texture)
+        self.mips = None if surface.texture is None else _Mips(surface.texture)
 
     def seen(
         self, triangle: NDArray[np.int64], rays: NDArray[np.float64], pose: NDArray[np.float64], step: float
@@ -147,28 +146,19 @@ def _shade(
     return out.astype(np.float32)
 
 
-@dataclass(frozen=True)
 class _Mips:
     """A texture with its mip levels one after the other in one array of texels, as OpenGL's trilinear filter has it."""
 
-    texels: NDArray[np.uint8]  # [n, 3]
-    offsets: NDArray[np.int64]  # [levels], of each level's first texel
-    sizes: NDArray[np.int64]  # [levels, 2], width and height
-
-    @staticmethod
-    def of(texture: NDArray[np.uint8]) -> _Mips:
+    def __init__(self, texture: NDArray[np.uint8]) -> None:
         levels = [texture]
         while max(texture.shape[:2]) > 1:
             rows, columns = (2 if side > 1 else 1 for side in texture.shape[:2])
             blocks = texture.reshape(texture.shape[0] // rows, rows, texture.shape[1] // columns, columns, 3)
             texture = (blocks.mean(axis=(1, 3)) + 0.5).astype(np.uint8)
             levels.append(texture)
-        counts = [level.shape[0] * level.shape[1] for level in levels]
-        return _Mips(
-            np.concatenate([level.reshape(-1, 3) for level in levels]),
-            np.cumsum([0, *counts[:-1]]),
-            np.array([level.shape[1::-1] for level in levels]),
-        )
+        self.texels = np.concatenate([level.reshape(-1, 3) for level in levels])  # [n, 3]
+        self.sizes = np.array([level.shape[1::-1] for level in levels])  # [levels, 2], width and height
+        self.offsets = np.cumsum(self.sizes.prod(axis=1)) - self.sizes.prod(axis=1)  # [levels], of the first texels
 
     def sample(self, coordinates: NDArray[np.float32], footprint: NDArray[np.float64]) -> NDArray[np.float32]:
         """Values `[n, 3]` in [0, 1] at coordinates `[n, 2]`; `footprint` `[n, 2, 2]` has their change from a sample to

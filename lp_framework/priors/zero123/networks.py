@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from lp_framework.errors import UserError, one_line, optional_import
-from lp_framework.priors.zero123.stored_tensor import StoredTensor
+from lp_framework.priors.zero123.tensor_files import StoredTensor
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 Dtype = Literal["float32", "bfloat16", "float16"]

@@ -16,9 +16,7 @@ from typing import Any, Literal
 
 from lp_framework.errors import UserError
 from lp_framework.priors.zero123.networks import Configs, Weights, clip_config, unet_config, vae_config
-from lp_framework.priors.zero123.original_names import clip_modules, renamed, unet_modules, vae_modules
-from lp_framework.priors.zero123.stored_tensor import StoredTensor
-from lp_framework.priors.zero123.torch_file import read_state_dict
+from lp_framework.priors.zero123.tensor_files import StoredTensor, read_state_dict
 
 Averages = Literal["ema", "raw"]
 Tensors = Mapping[str, StoredTensor]
@@ -120,3 +118,100 @@ def _clip_tensors(clip: Tensors) -> dict[str, StoredTensor]:
         else:
             tensors[name] = stored
     return tensors
+
+
+# ---------------------------------------------------------------- names
+
+# Each network has a table from the training code's modules to diffusers', which `renamed` applies; inverted, it leads
+# back. Modules that have the same name in both are in no table.
+
+RESNET = {
+    **{"in_layers.0": "norm1", "in_layers.2": "conv1", "emb_layers.1": "time_emb_proj"},
+    **{"out_layers.0": "norm2", "out_layers.3": "conv2", "skip_connection": "conv_shortcut"},
+}
+UNET_ENDS = {
+    **{"time_embed.0": "time_embedding.linear_1", "time_embed.2": "time_embedding.linear_2"},
+    **{"input_blocks.0.0": "conv_in", "out.0": "conv_norm_out", "out.2": "conv_out"},
+}
+VAE_MIDDLE = {
+    **{"mid.block_1": "mid_block.resnets.0", "mid.block_2": "mid_block.resnets.1"},
+    **{f"mid.attn_1.{each}": f"mid_block.attentions.0.to_{each}" for each in "qkv"},
+    **{
+        "mid.attn_1.norm": "mid_block.attentions.0.group_norm",
+        "mid.attn_1.proj_out": "mid_block.attentions.0.to_out.0",
+    },
+}
+CLIP_ENDS = {
+    "class_embedding": "embeddings.class_embedding",
+    "positional_embedding": "embeddings.position_embedding.weight",
+    "conv1": "embeddings.patch_embedding",
+    "ln_pre": "pre_layrnorm",  # sic
+    "ln_post": "post_layernorm",
+}
+CLIP_LAYER = {
+    **{"ln_1": "layer_norm1", "attn": "self_attn", "ln_2": "layer_norm2"},
+    **{"mlp.c_fc": "mlp.fc1", "mlp.c_proj": "mlp.fc2"},
+}
+
+
+def unet_modules(config: Mapping[str, Any]) -> dict[str, str]:
+    """The U-Net's, whose blocks the training code numbers through all levels.
+
+    A level of the way down has its residual blocks and a downsampling; of the way up one residual block more, and the
+    upsampling inside the last one.
+    """
+    names, layers = dict(UNET_ENDS), config["layers_per_block"]
+
+    def resnet(original: str, ours: str) -> None:
+        names.update({f"{original}.{inner}": f"{ours}.{its}" for inner, its in RESNET.items()})
+
+    resnet("middle_block.0", "mid_block.resnets.0")
+    names["middle_block.1"] = "mid_block.attentions.0"
+    resnet("middle_block.2", "mid_block.resnets.1")
+    for level, up in enumerate(config["up_block_types"]):
+        number = level * (layers + 1)
+        # The first of all input blocks is conv_in.
+        for blocks, first, way, count in (("input", number + 1, "down", layers), ("output", number, "up", layers + 1)):
+            for layer in range(count):
+                resnet(f"{blocks}_blocks.{first + layer}.0", f"{way}_blocks.{level}.resnets.{layer}")
+                names[f"{blocks}_blocks.{first + layer}.1"] = f"{way}_blocks.{level}.attentions.{layer}"
+        names[f"input_blocks.{number + 1 + layers}.0.op"] = f"down_blocks.{level}.downsamplers.0.conv"
+        after = 2 if up.startswith("CrossAttn") else 1  # the residual block, and the attention where there is any
+        names[f"output_blocks.{number + layers}.{after}.conv"] = f"up_blocks.{level}.upsamplers.0.conv"
+    return names
+
+
+def vae_modules(config: Mapping[str, Any]) -> dict[str, str]:
+    """The autoencoder's; the training code counts the decoder's levels from the other end."""
+    names: dict[str, str] = {}
+    levels, layers = len(config["block_out_channels"]), config["layers_per_block"]
+    for side, way, resnets in (("encoder", "down", layers), ("decoder", "up", layers + 1)):
+        names[f"{side}.norm_out"] = f"{side}.conv_norm_out"
+        names |= {f"{side}.{original}": f"{side}.{ours}" for original, ours in VAE_MIDDLE.items()}
+        for level in range(levels):
+            original = f"{side}.{way}.{level}"
+            ours = f"{side}.{way}_blocks.{level if way == 'down' else levels - 1 - level}"
+            names[f"{original}.{way}sample"] = f"{ours}.{way}samplers.0"
+            for layer in range(resnets):
+                names[f"{original}.block.{layer}"] = f"{ours}.resnets.{layer}"
+                names[f"{original}.block.{layer}.nin_shortcut"] = f"{ours}.resnets.{layer}.conv_shortcut"
+    return names
+
+
+def clip_modules(config: Mapping[str, Any]) -> dict[str, str]:
+    """Those of CLIP's image encoder; queries, keys and values are one module in OpenAI's, and three in ours."""
+    names = {original: f"vision_model.{ours}" for original, ours in CLIP_ENDS.items()}
+    for layer in range(config["num_hidden_layers"]):
+        original, ours = f"transformer.resblocks.{layer}", f"vision_model.encoder.layers.{layer}"
+        names |= {f"{original}.{inner}": f"{ours}.{its}" for inner, its in CLIP_LAYER.items()}
+    return names
+
+
+def renamed(key: str, modules: Mapping[str, str]) -> str:
+    """A tensor's name with its module, the longest that is in the table, as the table has it; others stay."""
+    parts = key.split(".")
+    for end in range(len(parts), 0, -1):
+        module = ".".join(parts[:end])
+        if module in modules:
+            return ".".join([modules[module], *parts[end:]])
+    return key

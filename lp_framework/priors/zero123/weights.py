@@ -1,15 +1,35 @@
-"""Where Zero123's weights come from: a checkpoint of the training code, a diffusers folder, the Hugging Face hub."""
+"""Where Zero123's weights come from: a checkpoint of the training code, a diffusers folder, the Hugging Face hub.
+
+A folder in diffusers' layout has a subfolder a network, each with a config.json and the weights. Two layouts of Zero123
+are in circulation. They differ in the name of the pose projection and of its tensors: `cc_projection`
+(`projection.weight`) and `clip_camera_projection` (`proj.weight`).
+"""
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from pathlib import Path
 
-from lp_framework.errors import UserError, one_line
-from lp_framework.priors.zero123 import folders
-from lp_framework.priors.zero123.networks import Dtype, Networks, assemble, packages
-from lp_framework.priors.zero123.original import Averages, read_original
+from safetensors import SafetensorError
+from safetensors.torch import save_file
 
+from lp_framework.data.reading import read_json
+from lp_framework.errors import UserError, one_line
+from lp_framework.priors.zero123.networks import Configs, Dtype, Networks, Weights, assemble, packages
+from lp_framework.priors.zero123.original import Averages, read_original
+from lp_framework.priors.zero123.tensor_files import StoredTensor, read_safetensors, read_state_dict
+
+PARTS, PROJECTIONS = ("unet", "vae", "image_encoder"), ("cc_projection", "clip_camera_projection")
+WEIGHT_FILES = [  # of diffusers and of transformers, best first
+    f"{stem}{variant}.{suffix}"
+    for suffix, transformers in (("safetensors", "model"), ("bin", "pytorch_model"))
+    for variant in ("", ".fp16")
+    for stem in ("diffusion_pytorch_model", transformers)
+]
+OLD_VAE_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}  # before diffusers 0.18
+LEFT_OVER = ("vision_model.embeddings.position_ids",)  # before transformers 4.31
 HUB_ID = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*")
 
 
@@ -31,7 +51,7 @@ def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dty
         raise UserError(f"{path}: is no folder of Zero123 in diffusers' layout, it holds no unet/config.json")
     if weights == "raw":
         raise UserError(f"{path}: is a folder, which holds one set of weights; prior.weights=raw is for a .ckpt file")
-    return assemble(path, *folders.read_folder(place), dtype)
+    return assemble(path, *read_folder(place), dtype)
 
 
 def download(hub_id: str, revision: str | None) -> Path:
@@ -59,7 +79,58 @@ def download(hub_id: str, revision: str | None) -> Path:
 def _needed(names: list[str]) -> list[str]:
     """Of a repository's files those that loading reads."""
     needed = []
-    for part in (*folders.PARTS, *folders.PROJECTIONS):
-        best = [f"{part}/{name}" for name in folders.WEIGHT_FILES if f"{part}/{name}" in names]
+    for part in (*PARTS, *PROJECTIONS):
+        best = [f"{part}/{name}" for name in WEIGHT_FILES if f"{part}/{name}" in names]
         needed += [f"{part}/config.json", *best[:1]]
     return needed
+
+
+# ---------------------------------------------------------------- folders
+
+
+def read_folder(path: Path) -> tuple[Configs, Weights]:
+    """Sizes and tensors of the four networks of a folder; `UserError` where a file is missing or cannot be read."""
+    projection = next((path / name for name in PROJECTIONS if (path / name).is_dir()), None)
+    if projection is None:
+        raise UserError(f"{path}: holds no pose projection, a folder {' or '.join(PROJECTIONS)}")
+    weights = {part: _weights(path / part) for part in PARTS}
+    weights["vae"] = {_vae_name(name): stored for name, stored in weights["vae"].items()}
+    weights["cc_projection"] = {name.partition(".")[2]: stored for name, stored in _weights(projection).items()}
+    return {part: read_json(path / part / "config.json") for part in PARTS}, weights
+
+
+def _weights(folder: Path) -> dict[str, StoredTensor]:
+    file = next((folder / name for name in WEIGHT_FILES if (folder / name).is_file()), None)
+    if file is None:
+        raise UserError(f"{folder}: holds no weights, none of {', '.join(WEIGHT_FILES)}")
+    tensors = read_state_dict(file) if file.suffix == ".bin" else read_safetensors(file)
+    return {name: stored for name, stored in tensors.items() if name not in LEFT_OVER}
+
+
+def _vae_name(name: str) -> str:
+    pattern = rf"(?<=\.)({'|'.join(OLD_VAE_NAMES)})(?=\.\w+$)"
+    return re.sub(pattern, lambda match: OLD_VAE_NAMES[match[1]], name) if ".attentions." in name else name
+
+
+def write_folder(networks: Networks, path: Path) -> None:
+    """Write the networks as safetensors in diffusers' layout (`cc_projection`), whole or not at all.
+
+    Raises `UserError` where that cannot be, as where the folder exists and is not empty.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+    projection = networks.cc_projection
+    sizes = {"in_channel": projection.in_features, "out_channel": projection.out_features}
+    tensors = {f"projection.{name}": tensor for name, tensor in projection.state_dict().items()}
+    try:
+        for part in PARTS:
+            getattr(networks, part).save_pretrained(partial / part)
+        folder = partial / "cc_projection"
+        folder.mkdir()
+        (folder / "config.json").write_text(json.dumps({"_class_name": "CCProjection", **sizes}, indent=2) + "\n")
+        save_file(tensors, folder / "diffusion_pytorch_model.safetensors", metadata={"format": "pt"})
+        partial.rename(path)
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{path}: cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
