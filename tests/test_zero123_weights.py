@@ -345,7 +345,7 @@ def test_every_kind_of_tensor_is_read(tmp_path):
 
 
 def test_a_converted_folder_gives_equal_weights(networks, folder):
-    assert not (folder.parent / "converted.partial").exists()
+    assert not (folder.parent / ".converted.partial").exists()
     assert same(load_networks(str(folder), None, "ema", "float32"), networks)
 
 
@@ -426,7 +426,7 @@ def test_writing_is_all_or_nothing(networks, folder, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("lp_framework.priors.zero123.weights.save_file", full)
-    with pytest.raises(UserError, match=r"cannot be written: .*No space left"):
+    with pytest.raises(UserError, match="the disk is full"):
         write_folder(networks, tmp_path / "new")
     assert list(tmp_path.iterdir()) == []
 

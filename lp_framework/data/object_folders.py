@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import json
 import math
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
+from safetensors import SafetensorError
 
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, TRANSFORMS
 from lp_framework.errors import UserError
@@ -24,12 +24,13 @@ from lp_framework.errors import UserError
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Make a `UserError` that names `folder` of an `OSError` in what is written into it."""
+    """Make a `UserError` that names `folder` of what goes wrong in writing into it."""
     try:
         yield
-    except OSError as error:
-        reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
-        raise UserError(f"{folder}: cannot be written ({reason}); what is finished is kept") from error
+    except (OSError, SafetensorError) as error:
+        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
+        reason = "the disk is full" if full else getattr(error, "strerror", error)
+        raise UserError(f"{folder}: cannot be written ({reason})") from error
 
 
 @contextmanager
@@ -41,18 +42,25 @@ def locked(folder: Path, lock: str) -> Iterator[None]:
             yield
 
 
-def write_object(folder: Path, record_file: str, record: Mapping[str, Any], write: Callable[[Path], None]) -> None:
-    """Have an object's folder written by `write`, with its record, whole or not at all."""
+@contextmanager
+def written_folder(folder: Path) -> Iterator[Path]:
+    """A hidden folder beside `folder` to write to; it takes its name at the end, and is removed where that fails."""
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
     try:
         with writing(folder):
             partial.mkdir(parents=True)
-            write(partial)
-            (partial / record_file).write_text(json.dumps(record, indent=1))
-            os.rename(partial, folder)
+            yield partial
+            partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def write_object(folder: Path, record_file: str, record: Mapping[str, Any], write: Callable[[Path], None]) -> None:
+    """Have an object's folder written by `write`, with its record, whole or not at all."""
+    with written_folder(folder) as partial:
+        write(partial)
+        (partial / record_file).write_text(json.dumps(record, indent=1))
 
 
 def write_transforms(

@@ -80,10 +80,8 @@ class Zero123Prior(Prior):
         self.eval().requires_grad_(False)
         side = IMAGE_SIZE // 2 ** (len(self.vae.config.block_out_channels) - 1)
         self.image_size, self.latent_shape = IMAGE_SIZE, (int(self.vae.config.latent_channels), side, side)
-        self.channels_last = channels_last
-        self.replayed = Replayed() if cuda_graph else None
-        release = None if self.replayed is None else self.replayed.forget
-        self.chunks, self.image_chunks = Chunks(max_batch, release), Chunks(max_batch, release)
+        self.channels_last, self.cuda_graph, self.replayed = channels_last, cuda_graph, Replayed()
+        self.chunks, self.image_chunks = (Chunks(max_batch, self.replayed.forget) for _ in range(2))
         alphas = scaled_linear_alphas()
         self.num_timesteps = len(alphas)
         self.register_buffer("alphas_cumprod", alphas, persistent=False)
@@ -92,8 +90,7 @@ class Zero123Prior(Prior):
 
     def _apply(self, function: Any, recurse: bool = True) -> Any:
         """Whatever moves or converts a module passes here."""
-        if self.replayed is not None:
-            self.replayed.forget()
+        self.replayed.forget()
         return super()._apply(function, recurse)
 
     # ------------------------------------------------------------ images
@@ -161,7 +158,7 @@ class Zero123Prior(Prior):
         inputs = pose, target.latent, source.latent, source.embedding, timestep, noise
         if pose.requires_grad and torch.is_grad_enabled():
             function = self._energy_and_slope
-            both = function if self.replayed is None else partial(self.replayed, function)
+            both = partial(self.replayed, function) if self.cuda_graph else function
             energies, _ = EnergyAndSlope.apply(pose, lambda part: both(*(each[part] for each in inputs)), self.chunks)
             return energies
         return torch.cat(self.chunks.run(lambda part: self._energy(*(each[part] for each in inputs)), len(pose)))

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 
-from safetensors import SafetensorError
 from safetensors.torch import save_file
 
+from lp_framework.data.object_folders import written_folder
 from lp_framework.data.reading import read_json
 from lp_framework.errors import UserError, one_line
 from lp_framework.priors.zero123.networks import Configs, Dtype, Networks, Weights, assemble, packages
@@ -117,20 +116,13 @@ def write_folder(networks: Networks, path: Path) -> None:
 
     Raises `UserError` where that cannot be, as where the folder exists and is not empty.
     """
-    partial = path.with_name(f"{path.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
     projection = networks.cc_projection
     sizes = {"in_channel": projection.in_features, "out_channel": projection.out_features}
     tensors = {f"projection.{name}": tensor for name, tensor in projection.state_dict().items()}
-    try:
+    with written_folder(path) as partial:
         for part in PARTS:
             getattr(networks, part).save_pretrained(partial / part)
         folder = partial / "cc_projection"
         folder.mkdir()
         (folder / "config.json").write_text(json.dumps({"_class_name": "CCProjection", **sizes}, indent=2) + "\n")
         save_file(tensors, folder / "diffusion_pytorch_model.safetensors", metadata={"format": "pt"})
-        partial.rename(path)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{path}: cannot be written: {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
