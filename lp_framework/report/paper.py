@@ -16,8 +16,6 @@ from typing import Any
 
 import yaml
 
-PAPER = "Landscape-Awareness for Geometric View Diffusion Model"
-
 
 @dataclass(frozen=True)
 class PaperRow:
@@ -51,13 +49,8 @@ class PaperTable:
 
         A run on a data set of the table is compared with that one's rows alone.
         """
-        rows = [
-            row for row in self.rows if all(settings.get(key, _NOWHERE) == value for key, value in row.settings.items())
-        ]
+        rows = [row for row in self.rows if row.settings.items() <= settings.items()]
         return [row for row in rows if row.data is not None and row.data == settings.get("data.name")] or rows
-
-
-_NOWHERE = object()
 
 
 def paper_table(experiment: str | None) -> PaperTable | None:
@@ -68,13 +61,13 @@ def paper_table(experiment: str | None) -> PaperTable | None:
 @cache
 def paper_tables() -> tuple[PaperTable, ...]:
     """All tables that are here, by name."""
-    files = sorted((Path(__file__).parent / "paper").glob("*.yaml"))
-    return tuple(_read(file.stem, yaml.safe_load(file.read_text(encoding="utf-8"))) for file in files)
-
-
-def _read(name: str, content: Mapping[str, Any]) -> PaperTable:
-    rows = []
-    for row in content["rows"]:
-        values = {key: value for key, value in zip(content["columns"], row["values"], strict=True) if value is not None}
-        rows.append(PaperRow(row["label"], row["settings"], row.get("data"), values))
-    return PaperTable(name, **{**content, "rows": rows})
+    tables = []
+    for file in sorted((Path(__file__).parent / "paper").glob("*.yaml")):
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        rows = []
+        for row in content["rows"]:
+            values = zip(content["columns"], row["values"], strict=True)
+            metrics = {name: value for name, value in values if value is not None}
+            rows.append(PaperRow(row["label"], row["settings"], row.get("data"), metrics))
+        tables.append(PaperTable(file.stem, **{**content, "rows": rows}))
+    return tuple(tables)

@@ -21,6 +21,8 @@ from lp_framework.evaluation.tables import RESULT
 
 HYDRA = Path(".hydra") / "hydra.yaml"  # what Hydra keeps of a job: its command and its choices
 COSTS = ("seconds_per_pair", "network_passes_per_pair")
+# Settings that are not compared: they change no result. The checkpoint has `checkpoint_setting`.
+ASIDE = ("plugins", "checkpoint", "seed", "batch_pairs", "pictures", "resume")
 Kind = Literal["eval", "train", "estimate", "landscape"]  # the commands whose runs have a page
 # What tells a run whose Hydra folder is gone: the first of these files that it has.
 FILES: dict[str, Kind] = {
@@ -33,17 +35,16 @@ FILES: dict[str, Kind] = {
 class Run:
     """A finished evaluation: its folder, the experiment's name if it had one, and what was set.
 
-    `settings` are dotted keys of the config without seeds, and `checkpoint`: the model's. `metrics` are over all
-    objects, `metrics_unique` over those with a unique answer (None where no object is labelled so); both hold the cost,
-    `COSTS`, too. A median error that is not finite is infinite.
+    `settings` are dotted keys of the config without seeds, and `checkpoint`: the model's. `metrics` are over `all`
+    objects, and over those with a `unique_answer` (None where no object is labelled so); both hold the cost, `COSTS`,
+    too. A median error that is not finite is infinite.
     """
 
     folder: Path
     experiment: str | None
     seed: int
     settings: Mapping[str, Any]
-    metrics: Mapping[str, float]
-    metrics_unique: Mapping[str, float] | None
+    metrics: Mapping[str, Mapping[str, float] | None]
     pairs: int
     checkpoint: str | None
 
@@ -88,7 +89,8 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
         except UserError as error:
             left_out.append(LeftOut(folder, str(error)))
             continue
-        same = next((other for other in runs if _identity(other) == _identity(run)), None)
+        it = run.settings, run.seed, run.checkpoint, run.experiment
+        same = next((one for one in runs if (one.settings, one.seed, one.checkpoint, one.experiment) == it), None)
         if same is None:
             runs.append(run)
         else:
@@ -102,14 +104,13 @@ def read_run(folder: Path) -> Run:
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
         costs = {name: float(result[name]) for name in COSTS}
-        unique = result["metrics_unique_answer"]
+        metrics = {"all": result["metrics"], "unique_answer": result["metrics_unique_answer"]}
         return Run(
             folder,
             _job(folder)[1],
             int(result["seed"]),
             {**settings(result["config"]), "protocol": result["protocol"], **checkpoint_setting(result["checkpoint"])},
-            {**_metrics(result["metrics"]), **costs},
-            None if unique is None else {**_metrics(unique), **costs},
+            {over: None if each is None else {**_metrics(each), **costs} for over, each in metrics.items()},
             int(result["pairs"]),
             result["checkpoint"],
         )
@@ -127,8 +128,12 @@ def settings(config: Mapping[str, Any]) -> dict[str, Any]:
     >>> settings({"seed": 1, "data": {"name": "toy", "seed": 1}, "solver": {"gamma": [0.0, 0.3, 0.0]}})
     {'data.name': 'toy', 'solver.gamma': 0.3}
     """
-    values = {key: _number(value) for key, value in dotted(config).items() if not _is_left_aside(key)}
-    return {key: _longitude_noise(value) if key.endswith(".gamma") else value for key, value in values.items()}
+    values = {key: _number(value) for key, value in dotted(config).items() if key not in ASIDE}
+    values = {key: value for key, value in values.items() if not key.endswith(".seed")}
+    for key, value in values.items():
+        if key.endswith(".gamma") and isinstance(value, list) and len(value) == 3 and value[0] == value[2] == 0:
+            values[key] = value[1]  # [0, g, 0] is the noise g
+    return values
 
 
 def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
@@ -140,14 +145,12 @@ def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
     if checkpoint is None:
         return {}
     path = Path(checkpoint)
-    configs = [folder / "config.yaml" for folder in (path.parent, path.parent.parent)]
-    file = next((each for each in configs if each.is_file()), None)
-    if file is None:
-        return {"checkpoint": checkpoint}
-    try:
-        return {"checkpoint": json.dumps({**settings(saved_config(file)), "file": path.name}, sort_keys=True)}
-    except UserError:
-        return {"checkpoint": checkpoint}
+    for file in (path.parent / "config.yaml", path.parent.parent / "config.yaml"):
+        try:
+            return {"checkpoint": json.dumps({**settings(saved_config(file)), "file": path.name}, sort_keys=True)}
+        except UserError:
+            continue
+    return {"checkpoint": checkpoint}
 
 
 def saved_config(file: Path) -> dict[str, Any]:
@@ -160,16 +163,10 @@ def saved_config(file: Path) -> dict[str, Any]:
 
 
 def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
-    """A short name for every value of the setting `checkpoint`: the model's name where that tells them apart, else the
-    training run's folder, else the path.
-    """
-    paths = {run.settings["checkpoint"]: Path(run.checkpoint) for run in runs if run.checkpoint is not None}
-    candidates: list[dict[str, str]] = [
-        {value: _model_name(value) or str(path) for value, path in paths.items()},
-        {value: str(path.parent.parent) for value, path in paths.items()},
-        {value: str(path) for value, path in paths.items()},
-    ]
-    return next((names for names in candidates if len(set(names.values())) == len(names)), candidates[-1])
+    """A name for every value of the setting `checkpoint`: the model's where that tells them apart, else the path."""
+    paths = {run.settings["checkpoint"]: run.checkpoint for run in runs if run.checkpoint is not None}
+    models = {value: _model_name(value) or path for value, path in paths.items()}
+    return models if len(set(models.values())) == len(models) else paths
 
 
 def _job(folder: Path) -> tuple[str | None, str | None]:
@@ -185,13 +182,6 @@ def _metrics(values: Mapping[str, float | None]) -> dict[str, float]:
     return {name: math.inf if value is None else float(value) for name, value in values.items()}
 
 
-def _is_left_aside(key: str) -> bool:
-    """Whether a key is not compared: seeds, plugin folders, what changes no result, and the checkpoint, which has
-    `checkpoint_setting`.
-    """
-    return key in ("plugins", "checkpoint", "seed", "batch_pairs", "pictures", "resume") or key.endswith(".seed")
-
-
 def _number(value: Any) -> Any:
     """A value with whole numbers as int, so that 0.0 is 0."""
     if isinstance(value, list):
@@ -199,19 +189,8 @@ def _number(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _longitude_noise(gamma: Any) -> Any:
-    """`[0, g, 0]` as g: both say the same noise."""
-    if isinstance(gamma, list) and len(gamma) == 3 and gamma[0] == gamma[2] == 0:
-        return gamma[1]
-    return gamma
-
-
 def _model_name(checkpoint: str) -> str | None:
     try:
         return str(json.loads(checkpoint)["model.name"])
     except (ValueError, KeyError, TypeError):  # a path
         return None
-
-
-def _identity(run: Run) -> tuple[Any, ...]:
-    return run.settings, run.seed, run.checkpoint, run.experiment

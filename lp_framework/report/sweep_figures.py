@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,17 +12,19 @@ from matplotlib.figure import Figure
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.report.paper import PaperRow
 from lp_framework.report.printed_tables import heading, shown
-from lp_framework.report.sweep_tables import Row, SweepTable
+from lp_framework.report.sweep_tables import Row, Spread, SweepTable, spreads
 from lp_framework.viz.sweeps import COLOURS, Curve, Entry, Panel, curves_figure, entries_figure
 
 AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins
-RECALL, SUCCESS = ([f"{prefix}@{degrees}" for degrees in ROTATION_THRESHOLDS] for prefix in ("R", "SR"))
+RECALL, SUCCESS, ROTATION_RECALL = (
+    [f"{prefix}@{degrees}" for degrees in ROTATION_THRESHOLDS] for prefix in ("R", "SR", "R(R)")
+)
 PANELS = {"Recall R (chosen start)": RECALL, "Success rate SR (all starts)": SUCCESS}
 WITHIN = [f"within {degrees}°" for degrees in ROTATION_THRESHOLDS]
 NOISE = "noise scale \u03b3 of the longitude"
 TIME = "seconds a pair (log scale)"
 SECONDS, SOLVER = "seconds_per_pair", "solver.name"
-ROTATION_RECALL = [f"R(R)@{degrees}" for degrees in ROTATION_THRESHOLDS]
+NONE = Spread(math.nan, math.nan)
 
 
 def sweep_figure(table: SweepTable) -> Figure | None:
@@ -34,13 +35,11 @@ def sweep_figure(table: SweepTable) -> Figure | None:
         return curves_figure(_panels(table, axis), paper)
     if len(table.rows) < 2 and table.paper is None:
         return None
-    entries = []
-    told: list[PaperRow] = []
-    for row, beside in table.beside_paper():
-        if row is not None:
-            entries.append(Entry(label(row.settings), row.means, row.stds))
-        entries += [Entry(f"paper: {each.label}", each.metrics, {}, paper=True) for each in beside if each not in told]
-        told += beside
+    entries: list[Entry] = []
+    for line in table.with_paper():
+        named = f"paper: {line.label}" if isinstance(line, PaperRow) else label(line.settings)
+        if named not in [entry.label for entry in entries]:
+            entries.append(Entry(named, spreads(line), isinstance(line, PaperRow)))
     return entries_figure(entries, PANELS, paper)
 
 
@@ -51,11 +50,10 @@ def cost_figure(table: SweepTable) -> Figure | None:
     solvers = [row.settings.get(SOLVER) for row in table.rows]
     if len(set(solvers)) < 2 or len(table.rows) > len(COLOURS) or is_swept(table, "start.count"):
         return None
-    marks = [(_called(table, row), row) for row in table.rows]
-    panels = []
-    for name in ROTATION_RECALL:
-        curves = [_curve(words, [(row.means[SECONDS], row.means[name], row.stds[name])]) for words, row in marks]
-        panels.append(Panel(name, TIME, curves, logarithmic=True))
+    panels = [
+        Panel(name, TIME, [_curve(_called(table, row), [row], None, name) for row in table.rows], logarithmic=True)
+        for name in ROTATION_RECALL
+    ]
     return curves_figure(panels, "")
 
 
@@ -76,22 +74,18 @@ def label(settings: Mapping[str, Any]) -> str:
     >>> label({"solver.first_stage": True, "solver.second_stage": True})
     'first stage and second stage'
     """
-    words = []
-    switches = {_last(key): value for key, value in settings.items() if isinstance(value, bool)}
+    words, switches = [], {}
     for key, value in settings.items():
-        if not isinstance(value, bool):
-            named = key.endswith(".name") or key == "checkpoint"
-            words.append(shown(value) if named else f"{_last(key)} {shown(value)}")
+        last = heading(key).rpartition(".")[2].replace("_", " ")
+        if isinstance(value, bool):
+            switches[last] = value
+        else:
+            words.append(shown(value) if key.endswith(".name") or key == "checkpoint" else f"{last} {shown(value)}")
     if switches and all(switches.values()):
         words.append(" and ".join(switches))
     elif switches:
         words.append("without " + " or ".join(name for name, on in switches.items() if not on))
     return ", ".join(words)
-
-
-def _last(key: str) -> str:
-    """The last part of a dotted key, in words."""
-    return heading(key).rpartition(".")[2].replace("_", " ")
 
 
 def _called(table: SweepTable, row: Row) -> str:
@@ -105,15 +99,12 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
     if axis == "views":
         return [Panel(name, "number of images", _curves(table, axis, {"": name})) for name in ("R@15", "R@30")]
     if axis == "start.count":
-        count = _curves(table, axis, {"": "R@30"})
-        time = _curves(table, axis, {"": "R@30"}, lambda _, metrics: metrics.get(SECONDS, math.nan))
-        time = [
-            replace(b, words=[shown(a.x[0]), *[""] * (len(a.x) - 2), shown(a.x[-1])])
-            for a, b in zip(count, time, strict=True)
-        ]
         first, *_, last = sorted({row.settings[axis] for row in table.rows})
         title = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
-        return [Panel("R@30 by number of starts", "number of starts", count), Panel(title, TIME, time, True)]
+        return [
+            Panel("R@30 by number of starts", "number of starts", _curves(table, axis, {"": "R@30"})),
+            Panel(title, TIME, _curves(table, axis, {"": "R@30"}, by_time=True), logarithmic=True),
+        ]
     if len(table.apart_from(axis)) > 1:  # a colour each
         return [
             Panel(f"{title}, {WITHIN[-1]}", NOISE, _curves(table, axis, {"": names[-1]}))
@@ -125,34 +116,24 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
     ]
 
 
-def _curves(
-    table: SweepTable,
-    axis: str,
-    metrics: Mapping[str, str],
-    place: Callable[[Any, Mapping[str, float]], float] = lambda value, _: float(value),
-) -> list[Curve]:
-    """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's.
-
-    `place` gives the horizontal position of a row by its value of `axis` and its metrics.
+def _curves(table: SweepTable, axis: str, metrics: Mapping[str, str], by_time: bool = False) -> list[Curve]:
+    """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's,
+    over the values of `axis` or over the seconds a pair.
     """
     curves = []
     for rows in table.apart_from(axis):
         words = label({key: value for key, value in rows[0].settings.items() if key != axis})
-        paper = [each for row in rows for each in table.papers(row.settings)]
+        papers = [each for row in rows for each in table.papers(row.settings)]
         for extra, name in metrics.items():
             title = ", ".join(filter(None, [words, extra]))
-            ours = [(place(row.settings[axis], row.means), row.means[name], row.stds[name]) for row in rows]
-            theirs = [
-                (place(each.settings[axis], each.metrics), each.metrics[name], math.nan)
-                for each in paper
-                if name in each.metrics
-            ]
-            curves.append(_curve(title, ours))
-            curves += [_curve(title, theirs, paper=True)] if theirs else []
+            curves.append(_curve(title, rows, None if by_time else axis, name))
+            if theirs := [each for each in papers if name in each.metrics]:
+                curves.append(_curve(title, theirs, None if by_time else axis, name))
     return curves
 
 
-def _curve(title: str, points: Sequence[tuple[float, float, float]], paper: bool = False) -> Curve:
-    """A curve through points: where they are, mean and standard deviation."""
-    x, mean, std = np.array(points).T
-    return Curve(title, x, mean, std, paper)
+def _curve(title: str, lines: Sequence[Row | PaperRow], axis: str | None, metric: str) -> Curve:
+    """A metric of rows over a setting, or over the seconds a pair."""
+    x = [spreads(line).get(SECONDS, NONE).mean if axis is None else float(line.settings[axis]) for line in lines]
+    mean, std = np.array([spreads(line)[metric] for line in lines]).T
+    return Curve(title, np.array(x), mean, std, isinstance(lines[0], PaperRow))

@@ -7,7 +7,6 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from lp_framework.report.paper import PaperRow, PaperTable, paper_table
@@ -17,10 +16,10 @@ Objects = Literal["unique_answer", "all"]
 
 
 class Spread(NamedTuple):
-    """Mean over seeds and sample standard deviation (n - 1), None for a single seed or where it is not finite."""
+    """Mean over seeds and sample standard deviation (n - 1), NaN for a single seed or where it is not finite."""
 
     mean: float
-    std: float | None
+    std: float
 
 
 @dataclass(frozen=True)
@@ -30,18 +29,8 @@ class Row:
     settings: Mapping[str, Any]
     metrics: Mapping[str, Spread]
     seeds: Sequence[int]
-    folders: Sequence[Path]
+    runs: Sequence[str]  # their folders
     pairs: int
-
-    @property
-    def means(self) -> dict[str, float]:
-        """The means of the metrics."""
-        return {name: value.mean for name, value in self.metrics.items()}
-
-    @property
-    def stds(self) -> dict[str, float]:
-        """Their standard deviations, NaN where there is none."""
-        return {name: math.nan if value.std is None else value.std for name, value in self.metrics.items()}
 
 
 @dataclass(frozen=True)
@@ -60,34 +49,38 @@ class SweepTable:
 
     def apart_from(self, axis: str) -> list[list[Row]]:
         """The rows in groups, in each of which they differ in nothing but the setting `axis`."""
+        others = [key for key in self.columns if key != axis]
         groups: dict[str, list[Row]] = {}
         for row in self.rows:
-            groups.setdefault(
-                json.dumps({key: row.settings.get(key) for key in self.columns if key != axis}), []
-            ).append(row)
+            groups.setdefault(json.dumps([row.settings.get(key) for key in others]), []).append(row)
         return list(groups.values())
 
     def papers(self, settings: Mapping[str, Any]) -> list[PaperRow]:
         """The paper's rows to compare a run of these settings with."""
         return [] if self.paper is None else self.paper.matching(settings)
 
-    def beside_paper(self) -> list[tuple[Row | None, list[PaperRow]]]:
-        """Every row with the paper's to compare it with; last, without a row of ours, the rest of the paper's."""
-        pairs: list[tuple[Row | None, list[PaperRow]]] = [(row, self.papers(row.settings)) for row in self.rows]
-        met = [each for _, rows in pairs for each in rows]
-        return [*pairs, (None, [each for each in (self.paper.rows if self.paper else []) if each not in met])]
+    def with_paper(self) -> list[Row | PaperRow]:
+        """The rows, each followed by the paper's to compare it with; the rest of the paper's are last."""
+        lines: list[Row | PaperRow] = []
+        for row in self.rows:
+            lines += [row, *self.papers(row.settings)]
+        return lines + [each for each in (self.paper.rows if self.paper else []) if each not in lines]
+
+
+def spreads(line: Row | PaperRow) -> Mapping[str, Spread]:
+    """The metrics of a row; a number of the paper has no spread."""
+    if isinstance(line, Row):
+        return line.metrics
+    return {name: Spread(value, math.nan) for name, value in line.metrics.items()}
 
 
 def sweep_tables(runs: Sequence[Run], objects: Objects) -> tuple[list[SweepTable], list[LeftOut]]:
     """A table an experiment, by name, those without one last; and the runs that have nothing to say of `objects`."""
-    left_out = []
-    if objects == "unique_answer":
-        reason = "no object is labelled as having a unique answer; objects=all counts every object"
-        left_out = [LeftOut(run.folder, reason) for run in runs if run.metrics_unique is None]
-        runs = [run for run in runs if run.metrics_unique is not None]
+    reason = "no object is labelled as having a unique answer; objects=all counts every object"
+    left_out = [LeftOut(run.folder, reason) for run in runs if run.metrics[objects] is None]
+    runs = [run for run in runs if run.metrics[objects] is not None]
     names = sorted({run.experiment for run in runs}, key=lambda name: (name is None, name or ""))
-    tables = [_table([run for run in runs if run.experiment == name], name, objects) for name in names]
-    return tables, left_out
+    return [_table([run for run in runs if run.experiment == name], name, objects) for name in names], left_out
 
 
 def spread(values: Sequence[float]) -> Spread:
@@ -97,7 +90,7 @@ def spread(values: Sequence[float]) -> Spread:
     Spread(mean=2.0, std=1.0)
     """
     mean = math.fsum(values) / len(values)
-    return Spread(mean, statistics.stdev(values) if len(values) > 1 and math.isfinite(mean) else None)
+    return Spread(mean, statistics.stdev(values) if len(values) > 1 and math.isfinite(mean) else math.nan)
 
 
 def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -110,13 +103,14 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     >>> varying([{"solver.name": "a", "solver.steps": 1}, {"solver.name": "b", "solver.steps": 2, "solver.tries": 1}])
     ['solver.name']
     """
+
+    def told_apart(keys: Sequence[str]) -> int:
+        return len({json.dumps({key: each[key] for key in keys if key in each}) for each in settings})
+
     keys = list(dict.fromkeys(key for each in settings for key in each))
-    varied = [key for key in keys if len(_values(settings, key)) > 1]
-    chosen = [key for key in varied if not _said_by_choice(settings, key)]
+    chosen = [key for key in keys if len(_values(settings, key)) > 1 and not _said_by_choice(settings, key)]
     for key in keys:
-        if len(_distinct(settings, chosen)) == len(_distinct(settings, keys)):
-            break
-        if key not in chosen and len(_distinct(settings, [*chosen, key])) > len(_distinct(settings, chosen)):
+        if told_apart([*chosen, key]) > told_apart(chosen):
             chosen.append(key)
     # Names come first, so that a number's values stand together.
     return sorted(chosen, key=lambda key: (not key.endswith(".name"), keys.index(key)))
@@ -136,37 +130,30 @@ def in_order(value: Any) -> tuple[int, float, str]:
 def _table(runs: Sequence[Run], experiment: str | None, objects: Objects) -> SweepTable:
     names = checkpoint_names(runs)
     groups: dict[str, list[Run]] = {}
-    for run in runs:
+    for run in sorted(runs, key=lambda run: (run.seed, str(run.folder))):
         groups.setdefault(json.dumps(run.settings, sort_keys=True), []).append(run)
-    shown = [_with_names(group[0].settings, names) for group in groups.values()]
+    shown = [
+        {key: names.get(value, value) if key == "checkpoint" else value for key, value in group[0].settings.items()}
+        for group in groups.values()
+    ]
     paper = paper_table(experiment)
     columns = varying(shown)
     columns += [key for key in (paper.settings if paper else []) if key not in columns and _values(shown, key)]
     rows = []
     for settings, group in zip(shown, groups.values(), strict=True):
-        group = sorted(group, key=lambda run: (run.seed, str(run.folder)))
-        chosen: list[Mapping[str, float]] = [
-            run.metrics_unique if objects == "unique_answer" and run.metrics_unique is not None else run.metrics
-            for run in group
-        ]
+        metrics = [found for run in group if (found := run.metrics[objects]) is not None]
         rows.append(
             Row(
                 {key: settings[key] for key in columns if key in settings},
-                {name: spread([each[name] for each in chosen]) for name in chosen[0]},
+                {name: spread([each[name] for each in metrics]) for name in metrics[0]},
                 [run.seed for run in group],
-                [run.folder for run in group],
+                [str(run.folder) for run in group],
                 group[0].pairs,
             )
         )
     rows.sort(key=lambda row: [in_order(row.settings.get(key)) for key in columns])
     common = {key: value for key, value in shown[0].items() if all(each.get(key) == value for each in shown)}
     return SweepTable(experiment, columns, rows, common, paper)
-
-
-def _with_names(settings: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    if "checkpoint" not in settings:
-        return dict(settings)
-    return {**settings, "checkpoint": names[settings["checkpoint"]]}
 
 
 def _values(settings: Sequence[Mapping[str, Any]], key: str) -> set[str]:
@@ -180,7 +167,3 @@ def _said_by_choice(settings: Sequence[Mapping[str, Any]], key: str) -> bool:
     if key == choice or len(names) == 1:
         return False
     return all(len(_values([each for each in settings if each.get(choice) == name], key)) == 1 for name in names)
-
-
-def _distinct(settings: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> set[str]:
-    return {json.dumps({key: each[key] for key in keys if key in each}) for each in settings}

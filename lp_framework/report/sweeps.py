@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.report.parts import Section, render
-from lp_framework.report.printed_tables import Layout, as_json, csv_rows, heading, layout, shown
+from lp_framework.report.printed_tables import Layout, csv_rows, heading, layout, shown
 from lp_framework.report.runs import LeftOut
 from lp_framework.report.sweep_figures import cost_figure, sweep_figure
 from lp_framework.report.sweep_tables import Objects, SweepTable
@@ -65,8 +65,14 @@ def write_sweeps(
         folder / "report.json",
         {
             "objects": objects,
-            "tables": [{**as_json(sweep.table), "figures": [file.name for file in sweep.files]} for sweep in sweeps],
+            "tables": [_as_json(sweep) for sweep in sweeps],
             "left_out": [{"folder": str(path), "reason": reason} for path, reason in left_out],
             **about,
         },
     )
+
+
+def _as_json(sweep: Sweep) -> dict[str, Any]:
+    metrics = [{name: value._asdict() for name, value in row.metrics.items()} for row in sweep.table.rows]
+    rows = [{**asdict(row), "metrics": each} for row, each in zip(sweep.table.rows, metrics, strict=True)]
+    return {**asdict(sweep.table), "rows": rows, "figures": [file.name for file in sweep.files]}

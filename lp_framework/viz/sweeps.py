@@ -24,7 +24,7 @@ PAPER = (0, (3, 2))  # dashes
 
 @dataclass(frozen=True)
 class Curve:
-    """Means `[K]` with standard deviations `[K]` (NaN for a single run) over `x` `[K]`, and a word at each, if any.
+    """Means `[K]` with standard deviations `[K]` (NaN for a single run) over `x` `[K]`.
 
     Curves of one `label` share a colour; the paper's are dashed, with hollow marks.
     """
@@ -34,7 +34,6 @@ class Curve:
     mean: NDArray
     std: NDArray
     paper: bool = False
-    words: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -49,11 +48,10 @@ class Panel:
 
 @dataclass(frozen=True)
 class Entry:
-    """Shares by metric of one combination of settings, means and standard deviations; or of a row of the paper."""
+    """Shares by metric of one combination of settings, mean and standard deviation; or of a row of the paper."""
 
     label: str
-    means: Mapping[str, float]
-    stds: Mapping[str, float]
+    metrics: Mapping[str, tuple[float, float]]
     paper: bool = False
 
 
@@ -66,7 +64,13 @@ def curves_figure(panels: Sequence[Panel], paper: str) -> Figure:
     labels = list(dict.fromkeys(curve.label for curve in drawn))
     for axes, panel in zip(row, panels, strict=True):
         for curve in panel.curves:
-            _draw_curve(axes, curve, labels.index(curve.label) % len(COLOURS))
+            place, theirs = labels.index(curve.label) % len(COLOURS), curve.paper
+            axes.errorbar(
+                curve.x, curve.mean, yerr=None if theirs else curve.std, color=COLOURS[place], marker=MARKERS[place],
+                markersize=4.5, markerfacecolor="white" if theirs else COLOURS[place], capsize=2, elinewidth=1.0,
+                linestyle=PAPER if theirs else "-", linewidth=1.0 if theirs else 1.5, clip_on=False,
+                zorder=2 if theirs else 3,
+            )  # fmt: skip
         _across(axes, panel)
         axes.set_title(panel.title)
         open_frame(axes)
@@ -86,23 +90,23 @@ def entries_figure(entries: Sequence[Entry], panels: Mapping[str, Sequence[str]]
     """
     figure = Figure(figsize=(8.0, 1.15 + 0.27 * len(entries)), layout=ConstrainedLayoutEngine(wspace=0.05))
     row = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    drawn = []
     for axes, (title, names) in zip(row, panels.items(), strict=True):
         for place, metric in enumerate(names):
             for line, entry in enumerate(entries):
-                if metric in entry.means:
+                if metric in entry.metrics:
+                    mean, std = entry.metrics[metric]
+                    drawn.append(mean)
                     axes.errorbar(
-                        entry.means[metric], line, xerr=entry.stds.get(metric, math.nan), color=COLOURS[place],
-                        marker=MARKERS[place], markersize=5, linestyle="none", elinewidth=1.2, capsize=2,
-                        markerfacecolor="white" if entry.paper else COLOURS[place], clip_on=False, zorder=3,
+                        mean, line, xerr=std, color=COLOURS[place], marker=MARKERS[place], markersize=5,
+                        linestyle="none", elinewidth=1.2, capsize=2, clip_on=False, zorder=3,
+                        markerfacecolor="white" if entry.paper else COLOURS[place],
                     )  # fmt: skip
         axes.set_title(title)
         axes.set_xlabel("share")
         open_frame(axes)
         axes.grid(visible=False, axis="x")
-    shown = [
-        entry.means[name] for entry in entries for names in panels.values() for name in names if name in entry.means
-    ]
-    row[0].set_xlim(_lowest(shown, 0.3), 1.0)
+    row[0].set_xlim(_lowest(drawn, 0.3), 1.0)
     row[0].set_yticks(range(len(entries)), [entry.label for entry in entries])
     row[0].set_ylim(len(entries) - 0.5, -0.5)
     for tick, entry in zip(row[0].get_yticklabels(), entries, strict=True):
@@ -111,17 +115,6 @@ def entries_figure(entries: Sequence[Entry], panels: Mapping[str, Sequence[str]]
     keys = [_key(f"within {each}°", place, linestyle="none", markersize=5) for place, each in enumerate(degrees)]
     _legend(figure, keys, paper if any(entry.paper for entry in entries) else None, linestyle="none", markersize=5)
     return figure
-
-
-def _draw_curve(axes: Axes, curve: Curve, place: int) -> None:
-    colour, paper = COLOURS[place], curve.paper
-    axes.errorbar(
-        curve.x, curve.mean, yerr=None if paper else curve.std, color=colour, marker=MARKERS[place], markersize=4.5,
-        markerfacecolor="white" if paper else colour, linestyle=PAPER if paper else "-", capsize=2, elinewidth=1.0,
-        linewidth=1.0 if paper else 1.5, clip_on=False, zorder=2 if paper else 3,
-    )  # fmt: skip
-    for x, y, word in zip(curve.x, curve.mean, curve.words, strict=False):
-        axes.annotate(word, (x, y), (5, -9), textcoords="offset points", fontsize=6.5, color=MUTED)
 
 
 def _key(label: str, place: int, **more: Any) -> Line2D:
