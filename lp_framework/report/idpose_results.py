@@ -50,26 +50,23 @@ def read_idpose_results(folder: str | Path, objects: Sequence[str]) -> list[IDPo
 
 def _pairs(file: Path, objects: Sequence[str]) -> list[IDPosePair]:
     label = file.parent.name if file.name == "pose.json" else file.stem
+    # Polar angles are counted from the pole, latitudes from the equator.
+    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     try:
         content = json.loads(file.read_bytes())
         anchor = str(content["anchor_vid"])
-        found = {
-            str(view): torch.tensor(entry["rel_sph"], dtype=torch.float64)
-            for view, entry in content["obs"].items()
-            if str(view) != anchor
-        }
+        others = {str(view): entry for view, entry in content["obs"].items() if str(view) != anchor}
+        poses = {view: torch.tensor(entry["rel_sph"], dtype=torch.float64) for view, entry in others.items()}
+        if not poses or any(pose.shape != (3,) for pose in poses.values()):
+            raise ValueError("three numbers each are wanted")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise UserError(
             f"{file}: needs anchor_vid, and obs with rel_sph for each other view ({type(error).__name__}: {error})"
         ) from error
-    if not found or any(pose.shape != (3,) for pose in found.values()):
-        raise UserError(f"{file}: needs a rel_sph of three numbers for each other view")
     named = [name for name in objects if f"_{name}_{anchor}+" in f"_{label}"]
     if not named:
         raise UserError(f"{file}: its name tells none of the objects {', '.join(objects)}")
-    # Polar angles are counted from the pole, latitudes from the equator.
-    flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-    return [IDPosePair(max(named, key=len), anchor, view, pose * flip) for view, pose in found.items()]
+    return [IDPosePair(max(named, key=len), anchor, view, pose * flip) for view, pose in poses.items()]
 
 
 def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
@@ -81,11 +78,8 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
     pairs = read_idpose_results(results, names)
     cameras = {name: omni3d_cameras(views, name) for name in {pair.object for pair in pairs}}
     for name, *both, _ in pairs:
-        for view in both:
-            if view not in cameras[name]:
-                raise UserError(
-                    f"{results}: has view {view} of '{name}', but {views}/{name}/poses/{view}.npy is missing"
-                )
+        if missing := {*both} - {*cameras[name]}:
+            raise UserError(f"{results}: has views whose {views}/{name}/poses/{missing.pop()}.npy is missing")
     reference = torch.stack([cameras[pair.object][pair.reference] for pair in pairs])
     query = torch.stack([cameras[pair.object][pair.query] for pair in pairs])
     scale = RADIUS / reference[:, :3, 3].norm(dim=-1)
@@ -112,10 +106,9 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
 
 def main(arguments: Sequence[str]) -> int:
     """Print the row of `RESULTS VIEWS`."""
-    if len(arguments) != 2:
-        print("usage: python -m lp_framework.report.idpose_results RESULTS VIEWS", file=sys.stderr)
-        return 2
     try:
+        if len(arguments) != 2:
+            raise UserError("give RESULTS and VIEWS: python -m lp_framework.report.idpose_results RESULTS VIEWS")
         result = evaluate_idpose(*arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
