@@ -38,7 +38,7 @@ from lp_framework.viz import errors_plot
 from lp_framework.viz.errors_plot import ObjectCard, cumulative, errors_figure, objects_figure
 from lp_framework.viz.maps import broken_at_seam, draw_map, field_figure
 from lp_framework.viz.style import ANSWER, save_figure
-from lp_framework.viz.training import Curve, read_curves, save_training_picture, training_figure
+from lp_framework.viz.training import Curve, read_losses, save_training_picture, training_figure
 
 TRUTH = torch.tensor([0.3, 5.6, 0.2])
 IMAGE = np.zeros((8, 8, 3), dtype=np.uint8)
@@ -296,9 +296,9 @@ METRICS = """epoch,lr-AdamW,step,train/loss,train/view_loss,val/loss
 def test_training_curves_come_from_the_log(tmp_path: Path):
     assert save_training_picture(tmp_path) == []
     (tmp_path / "metrics.csv").write_text(METRICS)
-    curves = read_curves(tmp_path / "metrics.csv")
+    curves, rate = read_losses(tmp_path / "metrics.csv")
     assert curves["train/loss"].step.tolist() == [19, 39] and curves["train/loss"].value.tolist() == [1.5, 0.75]
-    assert curves["val/loss"].value.tolist() == [0.5] and curves["lr-AdamW"].value.tolist() == [0.001, 0.0005]
+    assert curves["val/loss"].value.tolist() == [0.5] and rate.value.tolist() == [0.001, 0.0005]
     assert save_training_picture(tmp_path) == [tmp_path / "training.png"]
     assert (tmp_path / "training.pdf").is_file()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import resources
@@ -13,28 +13,19 @@ from typing import NamedTuple
 from plotly.offline import get_plotlyjs
 
 from lp_framework.evaluation.tables import write_text
-from lp_framework.report.estimates import estimate_part
-from lp_framework.report.evaluations import evaluation_part
-from lp_framework.report.landscapes import landscape_part
 from lp_framework.report.parts import RunPart, Section, packed, render
+from lp_framework.report.run_parts import PARTS
 from lp_framework.report.runs import Kind
-from lp_framework.report.trainings import training_part
 
 PAGE = "report.html"
 LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of the runs are in the table alone
-PARTS: Mapping[Kind, Callable[[Path], RunPart]] = {
-    "eval": evaluation_part, "train": training_part, "estimate": estimate_part, "landscape": landscape_part,
-}  # fmt: skip
-HEADINGS: Mapping[Kind, str] = {
-    "eval": "Evaluations", "train": "Trainings", "estimate": "Estimates", "landscape": "Landscapes",
-}  # fmt: skip
 
 
 class Listed(NamedTuple):
     """A run on the page of a set; `content` is all of it (HTML), None where there is no room for it."""
 
+    number: int
     folder: Path
-    kind: Kind
     part: RunPart
     content: str | None
 
@@ -48,23 +39,22 @@ def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequ
     """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened."""
     if len(runs) == 1:
         folder, kind = runs[0]
-        part = PARTS[kind](folder)
+        part = PARTS[kind][1](folder)
         *sections, configuration = part.sections
         return _write(path, replace(part, sections=[*sections, *above, configuration]))
-    listed: list[Listed] = []
+    listed: dict[str, list[Listed]] = {}
     size = 0
-    for folder, kind in runs:
-        part = PARTS[kind](folder)
+    for number, (folder, kind) in enumerate(runs):
+        heading, part_of = PARTS[kind]
+        part = part_of(folder)
         content = render("run.html.j2", part=part)
         fits = size + len(content) <= LARGEST
         size += len(content) if fits else 0
-        listed.append(Listed(folder, kind, part, content if fits else None))
-    sections = [*above]
-    for kind in dict.fromkeys(kind for _, kind in runs):
-        rows = [(number, run) for number, run in enumerate(listed) if run.kind == kind]
-        keys = list(dict.fromkeys(key for _, run in rows for key in run.part.numbers))
-        sections.append(Section(HEADINGS[kind], render("runs.html.j2", caption=HEADINGS[kind], keys=keys, rows=rows)))
-    sections.append(Section("Run by run", render("opened.html.j2", runs=listed)))
+        listed.setdefault(heading, []).append(Listed(number, folder, part, content if fits else None))
+    tables = [Section(heading, render("runs.html.j2", caption=heading, runs=some)) for heading, some in listed.items()]
+    in_order = sorted((run for some in listed.values() for run in some), key=lambda run: run.number)
+    opened = render("opened.html.j2", runs=in_order)
+    sections = [*above, *tables, Section("Run by run", opened)]
     return _write(path, RunPart("Report", f"{len(runs)} runs", {}, sections))
 
 

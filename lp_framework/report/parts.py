@@ -8,7 +8,7 @@ import gzip
 import io
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -23,11 +23,15 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
 from lp_framework.report.printed_tables import HEADINGS, number
+from lp_framework.report.runs import saved_config
 from lp_framework.viz.style import CLASS_COLOURS
 
-# What a damaged file leads to.
+# What a damaged file leads to; `UserError` is a `ValueError`.
 BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, UndefinedError)
 T = TypeVar("T")
+Record = Mapping[str, Any]
+About = tuple[str, str, Mapping[str, str]]  # title, subtitle, and the most important numbers by name
+Sections = Sequence[tuple[str, str, Callable[[Record], Mapping[str, Any]]]]  # title, template, and what fills it
 
 
 class Section(NamedTuple):
@@ -44,34 +48,44 @@ class RunPart:
     title: str
     subtitle: str
     numbers: Mapping[str, str]
-    sections: list[Section]
+    sections: Sequence[Section]
+
+
+def run_part(folder: Path, file: str, about: Callable[[Record], About], sections: Sections) -> RunPart:
+    """A run by the record in its JSON `file`, with these sections and, last, its configuration.
+
+    What is missing or damaged is told in its place; where the file is, the record is empty.
+    """
+    record, missing = dict[str, Any](), ""
+    try:
+        record = _read(folder / file, lambda text: dict(json.loads(text)))
+    except UserError as error:
+        missing = str(error)
+
+    def reason(error: Exception) -> str:
+        damaged = f"its files are damaged ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
+        return str(error) if isinstance(error, UserError) else missing or damaged
+
+    def section(title: str, template: str, values: Callable[[Record], Mapping[str, Any]]) -> Section:
+        try:
+            return Section(title, render(f"{template}.html.j2", **values(record)))
+        except BROKEN as error:
+            return Section(title, render("note.html.j2", text=f"Not shown: {reason(error)}."))
+
+    try:
+        title, subtitle, numbers = about(record)
+    except BROKEN as error:
+        title, subtitle, numbers = folder.name, f"run without results: {reason(error)}", {}
+    config = record.get("config") or tried(lambda: saved_config(folder / "config.yaml"), None)
+    text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True) if isinstance(config, Mapping) else None
+    last = {"config": text, "versions": record.get("versions"), "folder": folder}
+    shown = [*sections, ("Configuration and versions", "configuration", lambda _: last)]
+    return RunPart(title, subtitle, numbers, [section(*each) for each in shown])
 
 
 def render(template: str, **values: Any) -> str:
     """A template of this package with these values, in which text is escaped."""
     return _ENVIRONMENT.get_template(template).render(values)
-
-
-def section(title: str, template: str, values: Callable[[], Mapping[str, Any]]) -> Section:
-    """A section from its template; where its files are missing or damaged, a sentence that says so."""
-    try:
-        return Section(title, render(f"{template}.html.j2", **values()))
-    except UserError as error:
-        reason = str(error)
-    except BROKEN as error:
-        reason = f"its files are damaged ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
-    return Section(title, render("note.html.j2", text=f"Not shown: {reason}."))
-
-
-def configuration(folder: Path, record: Mapping[str, Any]) -> Section:
-    """The last section of a run: where it is, and the `config` and `versions` that its record has."""
-
-    def values() -> dict[str, Any]:
-        config = record.get("config")
-        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True) if isinstance(config, Mapping) else None
-        return {"config": text, "versions": record.get("versions"), "folder": folder}
-
-    return section("Configuration and versions", "configuration", values)
 
 
 def tried(value: Callable[[], T], otherwise: T) -> T:
@@ -80,14 +94,6 @@ def tried(value: Callable[[], T], otherwise: T) -> T:
         return value()
     except BROKEN:
         return otherwise
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """An object of JSON; `UserError` where it is missing or damaged."""
-    content = _read(file, json.loads)
-    if not isinstance(content, dict):
-        raise UserError(f"{file.name} is damaged (it holds no object)")
-    return content
 
 
 def read_rows(file: Path) -> list[dict[str, str]]:
@@ -100,7 +106,7 @@ def _read(file: Path, parse: Callable[[str], T]) -> T:
         return parse(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"there is no {file.name}") from None
-    except (OSError, ValueError, RecursionError, csv.Error) as error:
+    except (OSError, ValueError, TypeError, RecursionError, csv.Error) as error:
         raise UserError(f"{file.name} is damaged ({error})") from error
 
 
@@ -131,6 +137,16 @@ def metric(metrics: Mapping[str, float | None], key: str) -> str:
     return number(key, math.inf if value is None else value)
 
 
+def minus(text: str) -> str:
+    """Numbers in print with a minus sign where they have a hyphen."""
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def angle(radians: float) -> str:
+    """An angle in print."""
+    return minus(f"{math.degrees(radians):.1f}°")
+
+
 _ENVIRONMENT = Environment(
     loader=PackageLoader("lp_framework.report"),
     autoescape=lambda name: not str(name).endswith(".md.j2"),
@@ -138,9 +154,14 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"metric": metric, "picture": picture, "sheet": sheet, "words": words}
+_ENVIRONMENT.filters |= {
+    **{"metric": metric, "picture": picture, "sheet": sheet, "words": words, "minus": minus, "angle": angle},
+    "packed": lambda figure: packed(figure.to_json()),
+}
+_ENVIRONMENT.tests |= {"finite": math.isfinite}
 _ENVIRONMENT.globals |= {
     "classes": list(CLASS_COLOURS),
     "failure": ROTATION_THRESHOLDS[-1],
     "metrics": {key: HEADINGS.get(key, key) for key in (*COLUMNS, *ERRORS)},
+    "turn": 2 * math.pi,
 }

@@ -35,6 +35,15 @@ INK, MUTED, LINE, SURFACE, HALO, TRUTH, ANSWER, OTHERS, REFERENCE, GREY = (
 )  # fmt: skip
 WHITE, DARK = "#ffffff", "#3A3A3A"  # over a landscape, which is the same in both schemes
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK}
+AXIS = {"gridcolor": LINE, "linecolor": LINE, "zerolinecolor": LINE, "title": {"font": {"color": MUTED}}}
+LOOK = {
+    "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "hovermode": "closest",
+    "margin": {"l": 54, "r": 16, "t": 10, "b": 44}, "xaxis": AXIS, "yaxis": AXIS,
+    "scene": {"xaxis": AXIS, "yaxis": AXIS, "zaxis": AXIS, "aspectmode": "manual", "dragmode": "turntable"},
+    "legend": {"x": 0.99, "xanchor": "right", "bgcolor": SURFACE, "bordercolor": LINE, "borderwidth": 1},
+    "hoverlabel": {"bgcolor": SURFACE, "bordercolor": LINE, "font": {"color": INK}},
+    "uirevision": "kept",  # zoom and viewpoint stay when colours change
+}  # fmt: skip
 PLACE = "longitude %{x:.1f}°, latitude %{y:.1f}°"
 FRAMES = 40  # of a pair, at most
 ERROR_POINTS, LOSS_POINTS = 400, 2000  # of a curve
@@ -58,9 +67,9 @@ def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
     ticks = [0, *ROTATION_THRESHOLDS, 60, 90, 120, 180]
     across = {"tickvals": [math.sqrt(each) for each in ticks], "ticktext": [f"{each}°" for each in ticks]}
     figure = _figure(
-        xaxis=_axis("rotation error (square-root scale)", range=[0, math.sqrt(180)], **across),
-        yaxis=_axis("share of pairs within the error", range=[0, 1.01], tickformat=".0%"),
-        legend=_legend(yanchor="bottom", y=0.03),
+        xaxis={"title": {"text": "rotation error (square-root scale)"}, "range": [0, math.sqrt(180)], **across},
+        yaxis={"title": {"text": "share of pairs within the error"}, "range": [0, 1.01], "tickformat": ".0%"},
+        legend={"yanchor": "bottom", "y": 0.03},
     )
     for threshold in ROTATION_THRESHOLDS:
         figure.add_vline(math.sqrt(threshold), line={"color": MUTED, "width": 1, "dash": "dot"})
@@ -82,11 +91,14 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
     Where there are many records they are pale, and their running mean is drawn over them.
     """
     loss = {"type": "log", "domain": [0 if rate is None else 0.32, 1], "dtick": "D2", "tickformat": "~g"}
+    below = {"domain": [0, 0.22], "rangemode": "tozero", "nticks": 3, "exponentformat": "e"}
     figure = _figure(
-        xaxis=_axis("training step", anchor="y" if rate is None else "y2"), yaxis=_axis("loss (log scale)", **loss),
-        yaxis2=_axis("rate", domain=[0, 0.22], rangemode="tozero", nticks=3, exponentformat="e"),
-        legend=_legend(yanchor="top", y=0.99), margin={"l": 64, "r": 16, "t": 10, "b": 44},
-    )  # fmt: skip
+        xaxis={"title": {"text": "training step"}, "anchor": "y" if rate is None else "y2"},
+        yaxis={"title": {"text": "loss (log scale)"}, **loss},
+        yaxis2={"title": {"text": "rate"}, **below},
+        legend={"yanchor": "top", "y": 0.99},
+        margin={"l": 64},
+    )
     for (name, curve), colour in zip(losses.items(), (REFERENCE, ANSWER, GREY), strict=False):
         line = {"color": colour, "width": 2}
         if (window := len(curve.step) // 20) > 1:
@@ -108,8 +120,7 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray]) -> go.Figure:
     figure.add_trace(_image(_frustum(poses[0], poses[0, 2]), images[0], 2 * PIXELS))
     colours = [REFERENCE, *[ANSWER] * (len(poses) - 1)]
     for pose, image, colour in zip(poses, images, colours, strict=True):
-        frustum = _frustum(pose, furthest * (0.26 if len(poses) > 5 else 0.34))
-        figure.add_traces([_image(frustum, image), _line(frustum[OUTLINE], colour, 4)])
+        _add_camera(figure, pose, image, furthest * (0.26 if len(poses) > 5 else 0.34), colour, 4)
     text = {"text": [str(number) for number in range(len(poses))], "textposition": "top center", "textfont": FONT}
     marker = {"color": colours, "size": 5}
     return figure.add_trace(_trace(_centres(poses), mode="markers+text", marker=marker, hoverinfo="text", **text))
@@ -120,7 +131,7 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray]) -> go.Figure:
 
 def frame_steps(pair: ShownPair) -> list[int]:
     """The steps of the solver that the frames of a pair show, the last one among them."""
-    steps: list[int] = np.unique(np.linspace(0, _ways(pair).shape[1] - 1, FRAMES).round().astype(int)).tolist()
+    steps: list[int] = np.unique(np.linspace(0, _parts(pair)[1].shape[1] - 1, FRAMES).round().astype(int)).tolist()
     return steps
 
 
@@ -130,8 +141,8 @@ def map_plot(pair: ShownPair) -> go.Figure:
     limit = max(60.0, *(abs(math.degrees(each)) + 5 for each in np.nan_to_num(ends)))
     angle = {"ticksuffix": "°", "zeroline": False}
     figure = _figure(
-        xaxis=_axis("relative longitude", range=[0, 360], dtick=60, **angle),
-        yaxis=_axis("relative latitude", range=[-limit, limit], dtick=30, **angle),
+        xaxis={"title": {"text": "relative longitude"}, "range": [0, 360], "dtick": 60, **angle},
+        yaxis={"title": {"text": "relative latitude"}, "range": [-limit, limit], "dtick": 30, **angle},
     )
     bar = {"orientation": "h", "thickness": 8, "xpad": 0, "ypad": 6, "y": 1.0, "yanchor": "bottom", "outlinewidth": 0,
            "tickfont": {"size": 10}, "nticks": 6}  # fmt: skip
@@ -157,12 +168,11 @@ def surface_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes as relief, with the ways of all starts on it; the truth is a pole."""
     angle = {"ticksuffix": "°", "showspikes": False}
     axes = {
-        "xaxis": _axis("longitude", range=[0, 360], dtick=90, **angle),
-        "yaxis": _axis("latitude", dtick=30, **angle),
-        "zaxis": _axis("", nticks=4, showspikes=False),
+        "xaxis": {"title": {"text": "longitude"}, "range": [0, 360], "dtick": 90, **angle},
+        "yaxis": {"title": {"text": "latitude"}, "dtick": 30, **angle},
+        "zaxis": {"title": {"text": ""}, "nticks": 4, "showspikes": False},
     }
-    eye, centre = {"x": -0.5, "y": -1.65, "z": 2.1}, {"x": 0, "y": 0, "z": -0.15}
-    figure = _scene({"x": 1.7, "y": 1, "z": 0.65}, eye, centre, **axes)
+    figure = _scene((1.7, 1, 0.65), (-0.5, -1.65, 2.1), -0.15, **axes)
     moving: list[Moving] = []
     for name, landscape in pair.landscapes.items():
         only = _of(pair, name)
@@ -194,10 +204,9 @@ def pair_cameras_plot(pair: ShownPair) -> go.Figure:
         ball = _ball(np.radians(latitude) + reference[0], np.radians(longitude) + reference[1], GLOBE)
         shade = {"intensity": _numbers(energy.ravel()), "colorscale": RELIEF, "showscale": False}
         figure.add_mesh3d(**ball, **shade, **_of(pair, name), **look)
-    for pose, view, colour in ((reference, pair.reference, REFERENCE), (query, pair.query, TRUTH)):
-        if pose is not None:
-            frustum = _frustum(pose, distance)
-            figure.add_traces([_image(frustum, view.image), _line(frustum[OUTLINE], colour, 5)])
+    _add_camera(figure, reference, pair.reference.image, distance, REFERENCE, 5)
+    if query is not None:
+        _add_camera(figure, query, pair.query.image, distance, TRUTH, 5)
 
     def centres(poses: NDArray) -> NDArray:
         return _centres(reference + poses)
@@ -212,14 +221,10 @@ def pair_cameras_plot(pair: ShownPair) -> go.Figure:
     return _framed(figure, pair, [*moving, Moving(len(figure.data) - 1, answer, outline)])
 
 
-def _ways(pair: ShownPair) -> NDArray:
-    """Trajectories `[N, S, 3]`; of solvers that keep none, where the starts ended, `[N, 1, 3]`."""
-    return pair.ends[:, None] if pair.trajectories is None else pair.trajectories
-
-
 def _parts(pair: ShownPair) -> tuple[NDArray, NDArray]:
-    """The ways `[_, S, 3]` of the other starts, and of the answer."""
-    paths, chosen = _ways(pair), pair.chosen or 0  # a pair that was saved has one
+    """The ways `[_, S, 3]` of the other starts, and of the answer; of solvers that keep none, where they ended."""
+    paths = pair.ends[:, None] if pair.trajectories is None else pair.trajectories
+    chosen = pair.chosen or 0  # a pair that was saved has one
     return np.delete(paths, chosen, axis=0), paths[[chosen]]
 
 
@@ -251,11 +256,12 @@ def _add_moving(
     figure: go.Figure, pair: ShownPair, place: Points, others: str, sizes: Sequence[float], **more: Any
 ) -> list[Moving]:
     """Two traces of marks at the ends of the ways, for the other starts and for the answer."""
+    moving = []
     kinds = (("another start", others, "circle"), ("answer", ANSWER, "diamond"))
-    first = len(figure.data)
     for paths, (name, colour, symbol), size in zip(_parts(pair), kinds, sizes, strict=True):
+        moving.append(Moving(len(figure.data), paths, place))
         _add_marks(figure, place(paths[:, -1]), name, colour, size, symbol=symbol, **more)
-    return [Moving(number, paths, place) for number, paths in enumerate(_parts(pair), first)]
+    return moving
 
 
 def _framed(figure: go.Figure, pair: ShownPair, moving: Sequence[Moving]) -> go.Figure:
@@ -297,7 +303,7 @@ def _space(radius: float, longitude: float) -> go.Figure:
     x, y, _ = 1.9 * _standing(np.array([math.sin(longitude + 0.6), 0.0, math.cos(longitude + 0.6)]))
     sides = {"xaxis": 1.3, "yaxis": 1.3, "zaxis": 1.1}
     axes = {name: {"visible": False, "range": [-most * radius, most * radius]} for name, most in sides.items()}
-    figure = _scene({"x": 2, "y": 2, "z": 1.7}, {"x": x, "y": y, "z": 1}, {"x": 0, "y": 0, "z": -0.05}, **axes)
+    figure = _scene((2, 2, 1.7), (x, y, 1), -0.05, **axes)
     spokes, gap = _standing(radius * SPOKES), np.full(3, np.nan)
     parts = [point for spoke in spokes for point in (0.35 * spoke, spoke, gap)]
     figure.add_trace(_line(np.stack([*_standing(radius * ROUND), gap, *parts]), LINE, 2))
@@ -320,6 +326,12 @@ def _frustum(pose: NDArray, distance: float) -> NDArray:
     camera = camera_to_world(torch.from_numpy(pose)).numpy()
     plane = image_plane(camera, distance, math.radians(FIELD_OF_VIEW_DEGREES) / 2)
     return _standing(np.vstack([plane, camera[:3, 3]]))
+
+
+def _add_camera(figure: go.Figure, pose: NDArray, image: NDArray, distance: float, colour: str, width: float) -> None:
+    """What a camera sees at a distance, in the colour of its edges."""
+    frustum = _frustum(pose, distance)
+    figure.add_traces([_image(frustum, image), _line(frustum[OUTLINE], colour, width)])
 
 
 def _image(frustum: NDArray, image: NDArray, side: int = PIXELS) -> go.Mesh3d:
@@ -354,29 +366,15 @@ def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
 
 
 def _figure(**layout: Any) -> go.Figure:
-    look = {
-        "template": "none", "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "font": FONT,
-        "showlegend": "legend" in layout, "margin": {"l": 54, "r": 16, "t": 10, "b": 44}, "hovermode": "closest",
-        "hoverlabel": {"bgcolor": SURFACE, "bordercolor": LINE, "font": {"color": INK}},
-        "uirevision": "kept",  # zoom and viewpoint stay when colours change
-    }  # fmt: skip
-    return go.Figure(layout={**look, **layout})
+    own = {"showlegend": "legend" in layout, "font": FONT, **layout}
+    return go.Figure(layout={"template": {"layout": LOOK}, **own})
 
 
-def _scene(
-    aspect: Mapping[str, float], eye: Mapping[str, float], center: Mapping[str, float], **axes: Any
-) -> go.Figure:
-    view = {"aspectmode": "manual", "aspectratio": aspect, "dragmode": "turntable"}
-    return _figure(margin=dict.fromkeys("lrtb", 0), scene={**axes, **view, "camera": {"eye": eye, "center": center}})
-
-
-def _axis(title: str, **more: Any) -> dict[str, Any]:
-    lines = {"gridcolor": LINE, "linecolor": LINE, "zerolinecolor": LINE}
-    return {"title": {"text": title, "font": {"color": MUTED}}, **lines, **more}
-
-
-def _legend(**place: Any) -> dict[str, Any]:
-    return {"x": 0.99, "xanchor": "right", "bgcolor": SURFACE, "bordercolor": LINE, "borderwidth": 1, **place}
+def _scene(aspect: Sequence[float], eye: Sequence[float], below: float, **axes: Any) -> go.Figure:
+    """A figure in space: the lengths of its axes, and a camera that looks `below` the middle."""
+    camera = {"eye": dict(zip("xyz", eye, strict=True)), "center": {"x": 0, "y": 0, "z": below}}
+    scene = {**axes, "aspectratio": dict(zip("xyz", aspect, strict=True)), "camera": camera}
+    return _figure(margin=dict.fromkeys("lrtb", 0), scene=scene)
 
 
 def _line(points: NDArray, colour: str, width: float, **more: Any) -> go.Scatter | go.Scatter3d:

@@ -13,7 +13,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
-from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, VERMILION, open_frame, save_figure, styled
+from lp_framework.viz.style import BLUE, GREEN, INK, VERMILION, open_frame, save_figure, styled
 
 LOSSES = {"train/loss": (BLUE, "training loss"), "val/loss": (VERMILION, "validation loss"),
           "train/view_loss": (GREEN, "training, view readout")}  # fmt: skip
@@ -26,26 +26,27 @@ class Curve(NamedTuple):
     value: NDArray
 
 
-def read_curves(path: Path) -> dict[str, Curve]:
-    """All columns of a `metrics.csv` of Lightning's CSV logger over its column `step`; empty cells are left out."""
+def read_losses(path: Path) -> tuple[dict[str, Curve], Curve | None]:
+    """The curves of `LOSSES`, and the learning rate, in a `metrics.csv` of Lightning's CSV logger, over its `step`.
+
+    Empty cells are left out; a file that is not there has no curves.
+    """
     gathered: dict[str, list[tuple[float, float]]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            for name, cell in row.items():
-                if name != "step" and cell:
-                    gathered.setdefault(name, []).append((float(row["step"]), float(cell)))
-    return {name: Curve(*np.array(points).T) for name, points in gathered.items()}
+    if path.is_file():
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                for name, cell in row.items():
+                    if name != "step" and cell:
+                        gathered.setdefault(name, []).append((float(row["step"]), float(cell)))
+    curves = {name: Curve(*np.array(points).T) for name, points in gathered.items()}
+    rate = next((curve for name, curve in curves.items() if name.startswith("lr-")), None)
+    return {name: curves[name] for name in LOSSES if name in curves}, rate
 
 
 def save_training_picture(folder: Path) -> list[Path]:
     """`training.png` and `.pdf` in a training run's folder, from its `metrics.csv`; none where nothing was logged."""
-    metrics = folder / "metrics.csv"
-    curves = read_curves(metrics) if metrics.is_file() else {}
-    losses = {name: curves[name] for name in LOSSES if name in curves}
-    if not losses:
-        return []
-    rate = next((curve for name, curve in curves.items() if name.startswith("lr-")), None)
-    return save_figure(training_figure(losses, rate), folder / "training")[:1]
+    losses, rate = read_losses(folder / "metrics.csv")
+    return save_figure(training_figure(losses, rate), folder / "training")[:1] if losses else []
 
 
 def running_mean(values: NDArray, window: int) -> NDArray:
@@ -72,7 +73,7 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
         panels[1].ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
     drawn = []
     for name, curve in losses.items():
-        colour, label = LOSSES.get(name, (MUTED, name))
+        colour, label = LOSSES[name]
         window = len(curve.step) // 20
         if window > 1:
             # Single batches scatter: they stay visible, pale, behind their running mean.
