@@ -15,7 +15,6 @@ from tiny_runs import Commands
 from lp_framework.analysis.landscapes import Landscape
 from lp_framework.analysis.pairs import with_solution
 from lp_framework.analysis.shown import ShownPair, View
-from lp_framework.commands.landscape import start_longitudes
 from lp_framework.data.views import read_views
 from lp_framework.geometry import relative_pose
 from lp_framework.solvers.base import Cost, Solution
@@ -113,12 +112,12 @@ def test_a_start_that_came_to_no_pose_is_left_out():
     view = View(Path("a.png"), np.zeros((8, 8, 3), dtype=np.uint8), np.array([0.0, 0.0, 1.5]))
     pair = ShownPair("", "", "", view, view, np.array([0.0, 2.0, 0.0]))
     found = with_solution(pair, solution, starts, 0).arrived()
-    assert start_longitudes(found) == pytest.approx([0, math.degrees(2)]) and found.chosen == 1
+    assert found.start_longitudes() == pytest.approx([0, math.degrees(2)]) and found.chosen == 1
     assert found.rotation_errors == pytest.approx([math.degrees(2), 0], abs=1e-3)
     assert captions(found) == ["0°: 115° off", "115°: 0° off"] and found.energies.tolist() == [1.0, 0.5]
     own = with_solution(replace(pair, truth=None), solution, starts[:, :2], 0).arrived()
     assert own.starts is None and np.isnan(own.rotation_errors).all() and captions(own) == ["", ""]
-    assert start_longitudes(own) == [None, None]
+    assert own.start_longitudes() == [None, None]
     lost = with_solution(pair, replace(solution, chosen=torch.tensor([1])), starts, 0).arrived()
     assert lost.chosen is None and lost.failed and len(lost.ends) == 2
 

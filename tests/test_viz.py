@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -17,10 +18,11 @@ from matplotlib.image import imread
 from matplotlib.quiver import Quiver
 from torch import Tensor, nn
 
-from lp_framework.analysis.examples import EXAMPLES, gather_examples, pick_pairs, read_examples
+from lp_framework.analysis.examples import EXAMPLES, gather_examples, pick_examples, read_examples
 from lp_framework.analysis.fields import ExactModel, grid_poses, model_arrows, model_field
-from lp_framework.analysis.landscapes import Arrows, PoseMap, Ways, cell_grid
-from lp_framework.analysis.shown import ShownPair, View
+from lp_framework.analysis.landscapes import Arrows, cell_grid
+from lp_framework.analysis.pairs import in_one_scale
+from lp_framework.analysis.shown import PoseMap, ShownPair, View
 from lp_framework.commands.eval_pictures import save_pictures
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews
@@ -36,7 +38,7 @@ from lp_framework.solvers.starts import Grid as GridStarts
 from lp_framework.solvers.starts import Ring
 from lp_framework.viz import errors_plot
 from lp_framework.viz.errors_plot import ObjectCard, cumulative, errors_figure, objects_figure
-from lp_framework.viz.maps import broken_at_seam, draw_map, field_figure
+from lp_framework.viz.maps import broken_at_seam, draw_map, pair_figure
 from lp_framework.viz.style import ANSWER, save_figure
 from lp_framework.viz.training import Curve, read_losses, save_training_picture, training_figure
 
@@ -122,13 +124,14 @@ def exact_map(starts: int = 3) -> PoseMap:
         path.append(path[-1] + 0.1 * kernel.score(path[-1], TRUTH))
     (arrows,) = model_arrows(ExactModel(kernel, TRUTH[None]), PAIR, torch.tensor([0.2]), 12.0)
     paths = torch.stack(path, dim=1).numpy()
-    ways = Ways(paths[:, -1], starts - 1, start.numpy(), paths)
+    ways = replace(pair_of([], TRUTH.numpy()), chosen=starts - 1, starts=start.numpy())
+    ways = replace(ways, trajectories=paths, ends=paths[:, -1])
     return PoseMap("Exact score", arrows=arrows, ways=ways)
 
 
-def test_field_figure_shows_arrows_ways_answer_and_truth():
+def test_the_page_of_a_pair_shows_arrows_ways_answer_and_truth():
     content = exact_map()
-    figure = field_figure(pair_of([content, content], TRUTH.numpy()), "tram (twofold)", "worst: 36°")
+    figure = pair_figure(pair_of([], TRUTH.numpy()), [content, content], "tram (twofold)", "worst: 36°")
     maps = [axes for axes in figure.axes if axes.get_title("left") == "Exact score"]
     assert len(maps) == 2 and [axes.get_title("left") for axes in figure.axes[:2]] == ["reference", "query"]
     assert "tram (twofold)" in [text.get_text() for text in figure.texts]
@@ -158,18 +161,17 @@ def test_field_figure_shows_arrows_ways_answer_and_truth():
 
 def test_map_of_steep_views_shows_the_truth():
     steep = np.array([1.4, 0.0, 0.0])
-    figure = field_figure(pair_of([PoseMap("Starts and answer")], steep), "a", "b")
+    figure = pair_figure(pair_of([], steep), [PoseMap("Starts and answer")], "a", "b")
     assert figure.axes[-1].get_ylim() == (-90, 90)
 
 
 def test_broken_model_is_drawn_too():
     content = exact_map(1)
-    assert content.arrows is not None and content.ways is not None and content.ways.paths is not None
+    assert content.arrows is not None and content.ways is not None and content.ways.trajectories is not None
     nowhere = content.arrows._replace(score=np.full_like(content.arrows.score, np.nan))
-    lost = PoseMap(
-        "Learned score", arrows=nowhere, ways=content.ways._replace(chosen=0, paths=content.ways.paths * np.nan)
-    )
-    field_figure(pair_of([lost, lost], TRUTH.numpy()), "a", "b").draw_without_rendering()
+    ways = replace(content.ways, chosen=0, trajectories=content.ways.trajectories * np.nan)
+    lost = PoseMap("Learned score", arrows=nowhere, ways=ways)
+    pair_figure(pair_of([], TRUTH.numpy()), in_one_scale([lost, lost]), "a", "b").draw_without_rendering()
 
 
 def test_arrows_are_drawn_in_the_scale_that_they_are_given():
@@ -185,25 +187,25 @@ def test_arrows_are_drawn_in_the_scale_that_they_are_given():
 def test_pairs_are_picked_failures_first():
     errors = np.array([3.0, 170.0, 1.0, 60.0, 8.0, 170.0, 5.0, 90.0])
     objects = np.array([0, 1, 0, 0, 0, 1, 0, 1])
-    picks = pick_pairs(errors, objects, [True, False])
+    picks = pick_examples(errors, objects, ["a", "b"], [True, False])
     assert [pick.row for pick in picks] == [1, 3, 6, 2]  # ambiguous, worst, median, best
     assert [pick.reason.split()[0] for pick in picks] == ["median", "worst", "median", "best"]
     assert picks[0].reason == "median of 3 pairs without a unique answer"
     assert picks[1].reason == "worst of 5 pairs with a unique answer"
-    assert picks == pick_pairs(errors, objects, [True, False])
+    assert picks == pick_examples(errors, objects, ["a", "b"], [True, False])
 
 
-def test_unlabelled_pairs_are_picked_among_all():
-    assert [pick.row for pick in pick_pairs(np.array([1.0, 9.0, 2.0, 9.0]), np.zeros(4, int), [None])] == [1, 2, 0]
-
-
-def test_pair_without_an_answer_is_the_worst():
-    picks = pick_pairs(np.array([1.0, np.nan, 179.0]), np.zeros(3, int), [True])
-    assert [pick.row for pick in picks] == [1, 2, 0]
-
-
-def test_one_pair_is_one_picture():
-    assert len(pick_pairs(np.array([7.0]), np.zeros(1, int), [True])) == 1
+@pytest.mark.parametrize(
+    ("errors", "unique_answer", "rows"),
+    [
+        ([1.0, 9.0, 2.0, 9.0], None, [1, 2, 0]),  # unlabelled ones are picked among all
+        ([1.0, np.nan, 179.0], True, [1, 2, 0]),  # a pair without an answer is the worst
+        ([7.0], True, [0]),
+    ],
+)
+def test_the_worst_the_median_and_the_best_are_picked(errors: list[float], unique_answer: bool | None, rows: list[int]):
+    picks = pick_examples(np.array(errors), np.zeros(len(errors), int), ["a"], [unique_answer])
+    assert [pick.row for pick in picks] == rows
 
 
 # ------------------------------------------------------------ errors
@@ -423,8 +425,8 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
         ]
         batch, truth = data[np.array([views])], torch.from_numpy(pair.truth)
         np.testing.assert_allclose(pair.truth, batch.relative_poses()[0])
-        assert learned.ways is not None and learned.ways.paths is not None
-        assert learned.ways.paths.shape == (9, 101, 3) and learned.ways.chosen is not None
+        assert learned.ways is not None and learned.ways.trajectories is not None
+        assert learned.ways.trajectories.shape == (9, 101, 3) and learned.ways.chosen is not None
         # Solved again, the pair has the evaluation's answer.
         answer = rows["answer"][(rows["pair"] == batch.pairs[0]).all(dim=1)][0].numpy()
         np.testing.assert_allclose(learned.ways.ends[learned.ways.chosen], answer, atol=1e-4)
@@ -464,8 +466,8 @@ def test_solver_without_model_has_one_map_without_arrows(data: PairData):
     evaluation = evaluated(Guess(), data, Ring(4))
     pair = gather_examples(evaluation, data)[0]
     (content,) = pair.maps
-    assert content.arrows is None and content.ways is not None and content.ways.paths is None
-    figure = field_figure(pair, "a", "b")
+    assert content.arrows is None and content.ways is not None and content.ways.trajectories is None
+    figure = pair_figure(pair, pair.maps, "a", "b")
     assert len(figure.axes) == 3  # two images, one map, no colour bar
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["true pose", "answer"]
 

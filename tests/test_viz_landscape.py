@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from lp_framework.analysis.landscapes import PoseMap, Ways
-from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
-from lp_framework.viz.maps import RELIEF, draw_map, map_figure, pair_figure
+from lp_framework.analysis.landscapes import Landscape
+from lp_framework.analysis.shown import PRIOR_ENERGY, PoseMap, ShownPair, View
+from lp_framework.viz.maps import RELIEF, draw_map, pair_figure
 from lp_framework.viz.style import ANSWER, save_figure
 from lp_framework.viz.surface import surface_figure
 
@@ -37,9 +38,19 @@ WAYS = np.stack(
 )  # fmt: skip
 
 
-def took(paths: NDArray, chosen: int | None = None) -> Ways:
-    """The ways of a solver along paths `[N, S, 3]`."""
-    return Ways(paths[:, -1], chosen, paths[:, 0], paths)
+def took(paths: NDArray, chosen: int | None = None, landscape: Landscape = LANDSCAPE) -> ShownPair:
+    """A pair in which a solver went along paths `[N, S, 3]`, each ending a degree further off."""
+    view, numbers = View(Path("000.png"), IMAGE, TRUTH), np.arange(len(paths), dtype=float)
+    return ShownPair(
+        "duck", "unique", "", view, view, TRUTH, paths[:, 0], paths, paths[:, -1], 0 * numbers, chosen, numbers,
+        landscapes={PRIOR_ENERGY: landscape},
+    )  # fmt: skip
+
+
+def page(pair: ShownPair, title: str = "", views: list[NDArray] | None = None) -> Figure:
+    """The page of a pair with one map."""
+    content = PoseMap("tiny", relief=pair.prior_energy, ways=pair)
+    return pair_figure(pair, [content], title, "note", views or [])
 
 
 def lines(axes) -> list[NDArray]:
@@ -91,7 +102,7 @@ def test_without_trajectories_and_truth_there_is_only_the_landscape():
 
 def test_ends_alone_are_no_starts():
     axes = Figure().add_subplot()
-    draw_map(axes, PoseMap(relief=LANDSCAPE, ways=Ways(WAYS[:, -1], 0)), TRUTH)
+    draw_map(axes, PoseMap(relief=LANDSCAPE, ways=replace(took(WAYS, 0), starts=None, trajectories=None)), TRUTH)
     assert {round(longitude) for longitude, _ in marks(axes, "o")} == {50, 230} and not lines(axes)
 
 
@@ -104,7 +115,7 @@ def test_360_degrees_is_0_again():
 
 def test_a_plain_is_drawn_as_well():
     plain = of([[1.0] * 6] * 4)
-    for figure in (map_figure(plain), surface_figure(plain)):
+    for figure in (page(took(WAYS, 0, plain)), surface_figure(plain)):
         figure.draw_without_rendering()
 
 
@@ -124,20 +135,16 @@ def test_the_map_says_the_same_in_grey():
 def test_a_page_of_a_pair_has_all_in_its_place(count):
     views = [IMAGE] * count
     captions = [f"{90 * number % 360}\u00b0: {number}\u00b0 off" for number in range(count)]
-    ways, view = np.repeat(WAYS[:1], count, axis=0), View(Path("000.png"), IMAGE, TRUTH)
+    ways = np.repeat(WAYS[:1], count, axis=0)
     ways[:, 0, 1] = np.radians(90 * np.arange(count))
-    pair = ShownPair(
-        "duck", "unique", "", view, view, TRUTH, ways[:, 0], ways, ways[:, -1], np.zeros(count), 0 if count else None,
-        np.arange(count, dtype=float), landscapes={PRIOR_ENERGY: LANDSCAPE},
-    )  # fmt: skip
-    figure = pair_figure(pair, views, "duck", "note", "tiny")
+    figure = page(took(ways, 0 if count else None), "duck", views)
     figure.draw_without_rendering()
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles[:3] == ["reference", "query", "tiny"] and [each for each in titles if "off" in each] == captions
     texts = [*figure.texts, *figure.legends, *(part for axes in figure.axes for part in (axes.title, axes.xaxis.label))]
     boxes = [each.get_window_extent() for each in (*figure.axes, *texts)]
-    page = figure.bbox
-    assert all(box.x0 >= 0 and box.y0 >= 0 and box.x1 <= page.x1 and box.y1 <= page.y1 for box in boxes)
+    sheet = figure.bbox
+    assert all(box.x0 >= 0 and box.y0 >= 0 and box.x1 <= sheet.x1 and box.y1 <= sheet.y1 for box in boxes)
     shown = [axes.get_window_extent() for axes in figure.axes]
     for one in range(len(shown)):
         for other in range(one):
@@ -151,11 +158,11 @@ def test_a_page_of_a_pair_has_all_in_its_place(count):
 
 
 def test_a_long_key_stays_on_the_page():
-    figure = map_figure(LANDSCAPE, took(WAYS, 0), TRUTH, "tram")
+    figure = page(took(WAYS, 0), "tram")
     figure.draw_without_rendering()
     key = figure.legends[0].get_window_extent()
     assert key.x0 >= 0 and key.y0 >= 0 and key.x1 <= figure.bbox.x1
-    assert key.y1 < figure.axes[0].xaxis.label.get_window_extent().y0
+    assert key.y1 < figure.axes[2].xaxis.label.get_window_extent().y0
 
 
 # ---------------------------------------------------------------- the surface
@@ -194,7 +201,7 @@ def difference(one: NDArray, other: NDArray) -> float:
 
 
 FIGURES = {
-    "landscape_map": lambda: map_figure(LANDSCAPE, took(WAYS, 1), TRUTH, "wells"),
+    "landscape_page": lambda: page(took(WAYS, 1), "wells"),
     "landscape_surface": lambda: surface_figure(LANDSCAPE, TRUTH, "wells"),
 }
 
@@ -209,7 +216,7 @@ def test_pictures_look_as_they_did(name):
 
 
 def test_pictures_are_written(tmp_path):
-    files = save_figure(map_figure(LANDSCAPE, took(WAYS, 1), TRUTH), tmp_path / "map")
+    files = save_figure(page(took(WAYS, 1)), tmp_path / "page")
     assert [file.suffix for file in files] == [".png", ".pdf"]
     with Image.open(files[0]) as picture:
         assert picture.width > 1000 and picture.height > 400

@@ -185,27 +185,3 @@ class Arrows(NamedTuple):
     def longest(self) -> float:
         """The greatest length in the plane of the map, 0 for a field of nothing."""
         return float(np.nan_to_num(self.lengths(), posinf=0.0).max())
-
-
-class Ways(NamedTuple):
-    """What a solver did from N starts, as relative poses in radians and scene units: final poses `ends` `[N, 3]`, the
-    index of the answer `chosen`, and where known `starts` `[N, 3]` and `paths` `[N, S, 3]` (longitudes unreduced).
-    """
-
-    ends: NDArray
-    chosen: int | None = None
-    starts: NDArray | None = None
-    paths: NDArray | None = None
-
-
-class PoseMap(NamedTuple):
-    """A map of relative latitude and longitude: its title and what is on it, from the ground up.
-
-    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; the `ways` of a solver.
-    """
-
-    title: str = ""
-    relief: Landscape | None = None
-    density: Landscape | None = None
-    arrows: Arrows | None = None
-    ways: Ways | None = None

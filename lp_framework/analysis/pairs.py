@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +24,8 @@ from lp_framework.analysis.fields import (
     prior_landscapes,
 )
 from lp_framework.analysis.generated import generated_views
-from lp_framework.analysis.landscapes import Grid, Landscape, PoseMap, Ways, landscape_grid
-from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
+from lp_framework.analysis.landscapes import Grid, Landscape, landscape_grid
+from lp_framework.analysis.shown import PRIOR_ENERGY, PoseMap, ShownPair, View
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError, nearest
@@ -44,21 +43,17 @@ DENSITY_GRID = landscape_grid(60.0, 4.0, 6.0)
 # ---------------------------------------------------------------- which pairs
 
 
-def shown_pairs(
-    data: PairData, views: NDArray[np.int64], device: torch.device, reasons: Sequence[str] | None = None
-) -> tuple[Pairs, list[ShownPair]]:
+def shown_pairs(data: PairData, views: NDArray[np.int64], device: torch.device) -> tuple[Pairs, list[ShownPair]]:
     """P pairs of views (reference, query) by their numbers `[P, 2]` in the data's table; on a device, and as arrays."""
     table, batch, images = data.table, data[views], data.images
     assert images is not None  # nothing that is shown caches features
     shown = []
-    for place, pair in enumerate(views):
+    for pair, truth in zip(views, batch.relative_poses().numpy(), strict=True):
         index = int(table.object_of_view[pair[0]])
         reference, query = (
             View(table.files[view], np.asarray(images[view]), table.poses[view].numpy()) for view in pair
         )
-        reason = "" if reasons is None else reasons[place]
-        truth = batch.relative_poses()[place].numpy()
-        shown.append(ShownPair(table.names[index], table.ambiguities[index], reason, reference, query, truth))
+        shown.append(ShownPair(table.names[index], table.ambiguities[index], "", reference, query, truth))
     return pairs_of(batch, device), shown
 
 
@@ -154,17 +149,18 @@ def with_prior_energy(
 ) -> list[ShownPair]:
     """The pairs with the prior's landscape, on the paper's grid unless given, at the true relative radii or at 0."""
     radius = torch.tensor([0.0 if pair.truth is None else float(pair.truth[2]) for pair in shown])
-    return with_landscapes(shown, PRIOR_ENERGY, prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws))
+    return _with_landscapes(
+        shown, PRIOR_ENERGY, prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws)
+    )
 
 
 def with_model_landscape(pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel) -> list[ShownPair]:
     """The pairs with `model_landscapes` at their true relative radii."""
     name = "energy of the model" if model.has_energy else "length of the model's score"
-    return with_landscapes(shown, name, model_landscapes(model, pairs, truths(shown)[:, 2], landscape_grid()))
+    return _with_landscapes(shown, name, model_landscapes(model, pairs, truths(shown)[:, 2], landscape_grid()))
 
 
-def with_landscapes(shown: Sequence[ShownPair], name: str, found: Sequence[Landscape]) -> list[ShownPair]:
-    """The pairs with one more landscape each."""
+def _with_landscapes(shown: Sequence[ShownPair], name: str, found: Sequence[Landscape]) -> list[ShownPair]:
     return [replace(pair, landscapes={**pair.landscapes, name: each}) for pair, each in zip(shown, found, strict=True)]
 
 
@@ -172,50 +168,41 @@ def with_fields(
     pairs: Pairs,
     shown: Sequence[ShownPair],
     model: PoseModel,
-    ways: Sequence[Ways],
+    solved: Sequence[ShownPair],
     first_stage: Langevin | None,
     starts: Tensor,
     seed: int,
 ) -> list[ShownPair]:
-    """The pairs with two maps each: the model's field under `ways`, and the exact one, the best there is to learn.
+    """The pairs with two maps each, in one scale: the model's field, and the exact one, the best there is to learn.
 
-    On that are the ways of `first_stage` with the exact field in the model's place, where there is one.
+    An energy model has exp(-E) below it. Over the first are the ways of the pairs as they were `solved`, over the
+    second those of `first_stage` with the exact field in the model's place, where there is one.
     """
     exact = ExactModel(model.kernel, truths(shown), model.has_energy)
-    ideal: Sequence[Ways | None] = [None] * len(shown)
+    ideal: Sequence[ShownPair | None] = [None] * len(shown)
     if first_stage is not None:
         guided = copy.copy(first_stage)
         guided.model = exact  # type: ignore[assignment]  # has all of a PoseModel that this solver asks for
-        ideal = [pair.ways for pair in solved_pairs(pairs, shown, guided, starts, seed)]
-    field = "exp(-E) and score" if model.has_energy else "score"
-    learned = field_maps(pairs, shown, model, f"Learned {field}", ways)
-    oracle = field_maps(pairs, shown, exact, f"Exact {field} (oracle)", ideal)
-    return [replace(pair, maps=maps) for pair, *maps in zip(shown, learned, oracle, strict=True)]
+        ideal = solved_pairs(pairs, shown, guided, starts, seed)
+    name, radius = "exp(-E) and score" if model.has_energy else "score", truths(shown)[:, 2]
+    maps = []
+    for each, title, ways in ((model, f"Learned {name}", solved), (exact, f"Exact {name} (oracle)", ideal)):
+        densities: Sequence[Landscape | None] = [None] * len(shown)
+        if each.has_energy:
+            densities = [landscape.density() for landscape in model_landscapes(each, pairs, radius, DENSITY_GRID)]
+        arrows = model_arrows(each, pairs, radius, ARROW_SPACING)
+        parts = zip(densities, arrows, ways, strict=True)
+        maps.append([PoseMap(f"{title}, at the true relative radius", None, *part) for part in parts])
+    return [replace(pair, maps=in_one_scale(own)) for pair, *own in zip(shown, *maps, strict=True)]
 
 
-def field_maps(
-    pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel | ExactModel, title: str, ways: Sequence[Ways | None]
-) -> list[PoseMap]:
-    """A map a pair of a model's score and, of an energy model, of exp(-E), under the ways of a solver."""
-    radius = truths(shown)[:, 2]
-    densities: Sequence[Landscape | None] = [None] * len(shown)
-    if model.has_energy:
-        densities = [each.density() for each in model_landscapes(model, pairs, radius, DENSITY_GRID)]
-    arrows = model_arrows(model, pairs, radius, ARROW_SPACING)
-    return [PoseMap(title, None, *parts) for parts in zip(densities, arrows, ways, strict=True)]
+def in_one_scale(maps: Sequence[PoseMap]) -> list[PoseMap]:
+    """Maps whose arrows are all in the scale of the longest."""
+    scale = max(each.arrows.longest() for each in maps if each.arrows is not None)
+    return [each._replace(arrows=each.arrows and each.arrows._replace(scale=scale)) for each in maps]
 
 
 # ---------------------------------------------------------------- all of it
-
-
-class ExplainedPair(NamedTuple):
-    """A pair with its landscape, its ways and maps; what the prior generates at the ends, `[N, H, W, 3]` each; and the
-    model's field on the landscape's grid, where there is a model.
-    """
-
-    pair: ShownPair
-    views: list[NDArray]
-    field: FieldValue | None
 
 
 def explained_pair(
@@ -227,8 +214,9 @@ def explained_pair(
     starts: Tensor,
     draws: Draws,
     grid: Grid,
-) -> ExplainedPair:
-    """One pair, solved once, with those starts alone that came to a pose.
+) -> tuple[ShownPair, list[NDArray], FieldValue | None]:
+    """One pair, solved once, with those starts alone that came to a pose; what the prior generates at the ends,
+    `[N, H, W, 3]`; and the model's field on the landscape's grid, where there is a model.
 
     The maps are of the first stage without noise, over the model's field and over the exact one. Photographs, whose
     truth is not known, have none.
@@ -245,9 +233,9 @@ def explained_pair(
     if model is not None and pair.truth is not None:
         field = model_field(model, pairs, truths([pair])[:, 2], grid)
         first_stage = Langevin(model, gamma=0.0)
-        ways = [each.ways for each in solved_pairs(pairs, [pair], first_stage, starts, seed)]
-        (pair,) = with_fields(pairs, [pair], model, ways, first_stage, starts, seed)
-    return ExplainedPair(pair, views, field)
+        solved = solved_pairs(pairs, [pair], first_stage, starts, seed)
+        (pair,) = with_fields(pairs, [pair], model, solved, first_stage, starts, seed)
+    return pair, views, field
 
 
 def _array(values: Tensor) -> NDArray:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lp_framework.analysis.landscapes import Landscape, PoseMap, Ways
+from lp_framework.analysis.landscapes import Arrows, Landscape
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 
 PRIOR_ENERGY = "energy of the prior"
@@ -70,29 +71,38 @@ class ShownPair:
         return self.chosen is None or not self.rotation_errors[self.chosen] <= ROTATION_THRESHOLDS[-1]
 
     @property
-    def ways(self) -> Ways:
-        """What the solver did, for a map."""
-        return Ways(self.ends, self.chosen, self.starts, self.trajectories)
-
-    @property
     def prior_energy(self) -> Landscape:
         """The landscape of the prior."""
         return self.landscapes[PRIOR_ENERGY]
+
+    def start_longitudes(self) -> list[float] | list[None]:
+        """Of each end the longitude of its start, degrees in [0, 360); None where the solver made its own."""
+        if self.starts is None:
+            return [None] * len(self.ends)
+        longitudes: list[float] = (np.rad2deg(self.starts[:, 1]) % 360).tolist()
+        return longitudes
 
     def arrived(self) -> ShownPair:
         """The pair with those starts alone that came to a pose."""
         sound = np.isfinite(self.ends).all(axis=-1)
         lost = self.chosen is None or not sound[self.chosen]
-        return replace(
-            self,
-            starts=None if self.starts is None else self.starts[sound],
-            trajectories=None if self.trajectories is None else self.trajectories[sound],
-            ends=self.ends[sound],
-            energies=self.energies[sound],
-            chosen=None if lost else int(sound[: self.chosen].sum()),
-            rotation_errors=self.rotation_errors[sound],
-            translation_errors=self.translation_errors[sound],
-        )
+        names = ("starts", "trajectories", "ends", "energies", "rotation_errors", "translation_errors")
+        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        kept: dict[str, Any] = {name: each[sound] for name, each in known.items()}
+        return replace(self, chosen=None if lost else int(sound[: self.chosen].sum()), **kept)
+
+
+class PoseMap(NamedTuple):
+    """A map of relative latitude and longitude: its title and what is on it, from the ground up.
+
+    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; the `ways` that a solver took in a pair.
+    """
+
+    title: str = ""
+    relief: Landscape | None = None
+    density: Landscape | None = None
+    arrows: Arrows | None = None
+    ways: ShownPair | None = None
 
 
 def words(name: str) -> str:

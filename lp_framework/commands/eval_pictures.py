@@ -12,14 +12,14 @@ from lp_framework.data.pairs import PairData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.metrics import summarise
 from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
-from lp_framework.viz.maps import field_figure
+from lp_framework.viz.maps import pair_figure
 from lp_framework.viz.style import save_figure
 
 
 def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
-    """After `Trainer.test`: fields of some pairs (failures first), cumulative errors, and the objects, into `folder`.
+    """After `Trainer.test`: maps of some pairs (failures first), cumulative errors, and the objects, into `folder`.
 
-    Each as PNG and PDF; returns the PNG files. Sets of images have no fields. `EXAMPLES` below the folder gets the
+    Each as PNG and PDF; returns the PNG files. Sets of images have no maps. `EXAMPLES` below the folder gets the
     pairs, for the page of the run.
     """
     examples = gather_examples(evaluation, data)
@@ -27,8 +27,9 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
     rows, table = evaluation.metrics.rows(), evaluation.table
     rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
     figures = {
-        f"field_{number}": field_figure(pair, f"{pair.title} ({pair.ambiguity})", answer_note(pair))
-        for number, pair in enumerate(pair for pair in examples if pair.maps)
+        f"field_{number}": pair_figure(pair, pair.maps, f"{pair.title} ({pair.ambiguity})", answer_note(pair))
+        for number, pair in enumerate(examples)
+        if pair.maps
     }
     classes = [table.ambiguities[index] for index in rows["object"].tolist()]
     figures["errors"] = errors_figure(rotation, translation, chosen, classes)

@@ -19,10 +19,10 @@ from rich.table import Table
 
 from lp_framework.analysis.ambiguity import NEAR_DEGREES, overview
 from lp_framework.analysis.examples import EXAMPLES, save_examples
-from lp_framework.analysis.fields import Draws
+from lp_framework.analysis.fields import Draws, checked_draws
 from lp_framework.analysis.landscapes import landscape_grid
-from lp_framework.analysis.pairs import ExplainedPair, explained_pair, named_pairs
-from lp_framework.analysis.shown import ShownPair, View, words
+from lp_framework.analysis.pairs import explained_pair, named_pairs
+from lp_framework.analysis.shown import PoseMap, ShownPair, View, words
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import (
     Components,
@@ -38,11 +38,12 @@ from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, photograph_files, prepared_photographs
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_arrays, write_json
+from lp_framework.models.pose_model import FieldValue
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.azimuth import azimuth_figure
-from lp_framework.viz.maps import field_figure, pair_figure
+from lp_framework.viz.maps import minima_in_words, pair_figure
 from lp_framework.viz.style import save_figure
 from lp_framework.viz.surface import surface_figure
 
@@ -57,7 +58,7 @@ def run(config: DictConfig) -> None:
     folder = run_folder()
     seed_run(config.seed)
     grid = landscape_grid(config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees)
-    draws = Draws(list(config.timesteps), config.noises, config.seed, config.batch)
+    draws = checked_draws(config.timesteps, config.noises, config.seed, config.batch)
     device = choose_device(config.accelerator)
     components = Components(plain(config))
     console = Console(width=None if Console().is_terminal else 110, highlight=False)
@@ -77,22 +78,27 @@ def run(config: DictConfig) -> None:
         model = None if pair.truth is None else components["model"].to(device)
         starts = components["start"].make(pairs, config.seed)
         with shown_progress():
-            found = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
-        write_pair(console, config, folder, found, draws, components.checkpoint)
+            pair, views, field = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
+        write_arrays(folder / "landscape.npz", landscape_arrays(pair, field))
+        checkpoint = str(components.checkpoint) if components.checkpoint else None
+        record = {**summary(pair), "checkpoint": checkpoint, "seed": config.seed}
+        write_json(folder / "landscape.json", {**record, "config": plain(config), "versions": versions()})
+        pictures = save_pictures(folder, config, pair, views, draws)
+        console.print(pair_table(f"{pair.object}, prior={config.prior.name}", words(config.solver.name), record))
+        console.print(f"results: {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
+        console.print(
+            f"picture: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True
+        )
     console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
 
 
 def check(config: DictConfig) -> None:
     """`UserError` for settings that no landscape has."""
-    for key, least in (("azimuths", 2), ("noises", 1), ("batch", 1)):
-        if not isinstance(config[key], int) or config[key] < least:
-            raise UserError(f"{key} must be a whole number, at least {least}, got {config[key]}")
+    if not isinstance(config.azimuths, int) or config.azimuths < 2:
+        raise UserError(f"azimuths must be a whole number, at least 2, got {config.azimuths}")
     for key in ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degrees"):
         if not isinstance(config[key], int | float):
             raise UserError(f"{key} must be a number, got {config[key]}")
-    steps = list(config.timesteps) if isinstance(config.timesteps, Sequence) else []
-    if not steps or not all(isinstance(each, int) for each in steps):
-        raise UserError(f"timesteps must list whole numbers, one at least, got {config.timesteps}")
     if config.object is None and config.images is None:
         given = (override.partition("=")[0] for override in HydraConfig.get().overrides.task)
         for key in given:
@@ -105,31 +111,24 @@ def check(config: DictConfig) -> None:
 # ---------------------------------------------------------------- a pair
 
 
-def write_pair(
-    console: Console, config: DictConfig, folder: Path, found: ExplainedPair, draws: Draws, checkpoint: Path | None
-) -> None:
-    """Write `landscape.npz`, `landscape.json` and the pictures `landscape`, `surface` and `fields`; print the minima.
-
-    Of photographs, whose truth is not known, the slice is at relative radius 0, and there are no fields.
-    """
-    pair, method = found.pair, words(config.solver.name)
-    write_arrays(folder / "landscape.npz", landscape_arrays(found))
-    record = {**summary(pair), "checkpoint": str(checkpoint) if checkpoint else None, "seed": config.seed}
-    write_json(folder / "landscape.json", {**record, "config": plain(config), "versions": versions()})
+def save_pictures(
+    folder: Path, config: DictConfig, pair: ShownPair, views: Sequence[NDArray], draws: Draws
+) -> list[Path]:
+    """The pictures `landscape`, `surface` and `fields`; the last not of photographs, whose truth is not known."""
+    energy, method = pair.prior_energy, words(config.solver.name)
+    radius = f"{'' if pair.truth is None else 'true '}relative radius {energy.radius:+.2f}".replace("-", "\u2212")
+    note = f"{minima_in_words(energy)} at the {radius}. {draws.in_words()}"
     heading = f"Energy of prior {config.prior.name}, ways of {method}"
     figures = {
-        "landscape": pair_figure(pair, found.views, pair.object, energy_note(pair, draws), heading),
-        "surface": surface_figure(pair.prior_energy, pair.truth, pair.object),
+        "landscape": pair_figure(pair, [PoseMap(heading, relief=energy, ways=pair)], pair.object, note, views),
+        "surface": surface_figure(energy, pair.truth, pair.object),
     }
     if pair.maps:
         note = "ways of the first stage without noise (langevin, gamma 0)"
-        figures["fields"] = field_figure(pair, pair.object, note)
-    pictures = [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
+        figures["fields"] = pair_figure(pair, pair.maps, pair.object, note)
     example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
     save_examples(folder / "pictures" / EXAMPLES, [example])
-    console.print(pair_table(f"{pair.object}, prior={config.prior.name}", method, record))
-    console.print(f"results: {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
-    console.print(f"picture: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True)
+    return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
 
 
 def data_pair(config: DictConfig, data: PairDataModule, device: torch.device) -> tuple[Pairs, ShownPair]:
@@ -157,28 +156,18 @@ def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownP
     return pairs, ShownPair(f"{reference.name} and {query.name}", "unlabelled", "", reference, query)
 
 
-def landscape_arrays(found: ExplainedPair) -> dict[str, Any]:
+def landscape_arrays(pair: ShownPair, field: FieldValue | None) -> dict[str, Any]:
     """What goes into `landscape.npz`: radians and scene units."""
-    pair, landscape = found.pair, found.pair.prior_energy
+    landscape = pair.prior_energy
     arrays = {
         "latitude": landscape.latitude.numpy(), "longitude": landscape.longitude.numpy(),
         "radius": np.float32(landscape.radius), "energy": landscape.energy.numpy(),
-        "trajectories": pair.ends[:, None] if pair.trajectories is None else pair.trajectories, "truth": pair.truth,
+        "trajectories": pair.ends[:, None] if pair.trajectories is None else pair.trajectories,
     }  # fmt: skip
-    if found.field is not None:
-        arrays |= {f"model_{name}": None if value is None else value[0].cpu().numpy()
-                   for name, value in found.field._asdict().items()}  # fmt: skip
-    return {name: each for name, each in arrays.items() if each is not None}
-
-
-def energy_note(pair: ShownPair, draws: Draws) -> str:
-    """How many minima the landscape has, and what its energy is the mean of."""
-    count, radius = len(pair.prior_energy.minima()), f"{pair.prior_energy.radius:+.2f}".replace("-", "\u2212")
-    return (
-        f"{count} local {'minimum' if count == 1 else 'minima'} at the "
-        f"{'' if pair.truth is None else 'true '}relative radius {radius}; mean of "
-        f"{len(draws.steps())} noises at timesteps {', '.join(map(str, draws.timesteps))}"
-    )
+    if pair.truth is not None:
+        arrays["truth"] = pair.truth
+    fields = {} if field is None else {"model_score": field.score, "model_energy": field.energy}
+    return arrays | {name: each[0].cpu().numpy() for name, each in fields.items() if each is not None}
 
 
 def summary(pair: ShownPair) -> dict[str, Any]:
@@ -199,18 +188,10 @@ def summary(pair: ShownPair) -> dict[str, Any]:
             {"start_longitude": start, "end": in_degrees(end), "rotation_error": error, "energy": energy,
              "chosen": number == pair.chosen}
             for number, (start, end, error, energy) in enumerate(
-                zip(start_longitudes(pair), pair.ends, errors, pair.energies.tolist(), strict=True)
+                zip(pair.start_longitudes(), pair.ends, errors, pair.energies.tolist(), strict=True)
             )
         ],
     }  # fmt: skip
-
-
-def start_longitudes(pair: ShownPair) -> list[float] | list[None]:
-    """Longitudes of the starts, degrees in [0, 360); None for each end of a solver that makes its own."""
-    if pair.starts is None:
-        return [None] * len(pair.ends)
-    degrees: list[float] = (torch.from_numpy(pair.starts[:, 1]).rad2deg() % 360).tolist()
-    return degrees
 
 
 def in_degrees(pose: NDArray) -> tuple[float, float, float]:

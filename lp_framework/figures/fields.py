@@ -19,9 +19,9 @@ from lp_framework.analysis.fields import (
     prior_field,
     prior_landscapes,
 )
-from lp_framework.analysis.landscapes import Arrows, Landscape, PoseMap, cell_grid, landscape_grid
+from lp_framework.analysis.landscapes import Arrows, Landscape, cell_grid, landscape_grid
 from lp_framework.analysis.pairs import named_pairs, object_index, truths
-from lp_framework.analysis.shown import ShownPair
+from lp_framework.analysis.shown import PoseMap, ShownPair
 from lp_framework.figures.base import EnergyFigure, PairsFigure, energy_model, score_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register

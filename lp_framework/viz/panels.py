@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lp_framework.analysis.landscapes import FLAT, Landscape, PoseMap
-from lp_framework.analysis.shown import ShownPair
-from lp_framework.viz.maps import draw_map, errors_in_words, start_names
+from lp_framework.analysis.landscapes import Landscape
+from lp_framework.analysis.shown import PoseMap, ShownPair
+from lp_framework.viz.maps import draw_map, errors_in_words, minima_in_words, small_marks, start_names
 from lp_framework.viz.style import ANSWER, ASIDE, INK, Sheet, letter, styled
 from lp_framework.viz.surface import small_surface
 
@@ -37,12 +37,6 @@ def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
         axes.set_xlabel("longitude", fontsize=7, labelpad=-8)
         axes.set_ylabel("latitude", fontsize=7, labelpad=-8)
     return sheet.figure
-
-
-def minima_in_words(landscape: Landscape) -> str:
-    """How many minima there are, or that it is a plateau."""
-    count = len(landscape.minima())
-    return "plateau" if landscape.flatness() >= FLAT else f"{count} minim{'um' if count == 1 else 'a'}"
 
 
 @styled
@@ -73,10 +67,7 @@ def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -
     wide = WIDTH - SIDE - x
     high = wide * 0.52
     sheet.above(x, TITLE, "(d) landscape")
-    axes = sheet.axes(x, TITLE, wide, high)
-    draw_map(axes, PoseMap(relief=pair.prior_energy, ways=pair.ways), pair.truth, small=True)
-    axes.set_xlabel("longitude", labelpad=1)
-    axes.set_ylabel("latitude", labelpad=0)
+    _place_map(sheet, (x, TITLE, wide, high), PoseMap(relief=pair.prior_energy, ways=pair), pair.truth)
     lower = TITLE + high + 0.26
     small_surface(sheet, x - 0.2, lower, wide + 0.2, sheet.height - lower + 0.02, pair.prior_energy, pair.truth)
     return sheet.figure
@@ -117,12 +108,8 @@ def failures_figure(rows: Sequence[FailureRow]) -> Figure:
                 sheet.image(left + column * (view + GAP), y, view, picture)
         for column, longitude in enumerate(longitudes):
             sheet.above(left + column * (view + GAP) + view / 2, top, f"{longitude:g}°", ha="center", **SMALL)
-        axes = sheet.axes(right, upper, wide, block - 0.1)
-        draw_map(axes, PoseMap(relief=pair.prior_energy), pair.truth, small=True)
-        axes.tick_params(labelsize=7)
-        axes.set_ylabel("latitude", labelpad=0)
-        if number == len(rows) - 1:
-            axes.set_xlabel("longitude", labelpad=1)
+        box, last = (right, upper, wide, block - 0.1), number == len(rows) - 1
+        _place_map(sheet, box, PoseMap(relief=pair.prior_energy), pair.truth, last=last)
     return sheet.figure
 
 
@@ -140,7 +127,7 @@ def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
         row, column = divmod(number, 2)
         x, y = left + column * (WIDE + 0.12), TITLE + row * (TITLE + TALL)
         sheet.above(x, y, letter(number + 1, content.title))
-        _place_map(sheet, x, y, WIDE, content, pair.truth, first=column == 0, last=row == 1)
+        _place_map(sheet, (x, y, WIDE, TALL), content, pair.truth, first=column == 0, last=row == 1)
     for row, (title, density) in enumerate(densities.items()):
         y = TITLE + row * (TITLE + TALL)
         sheet.above(right, y, letter(len(pair.maps) + 1 + row, title))
@@ -165,18 +152,25 @@ def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figu
         for place, view in enumerate((pair.reference, pair.query)):
             sheet.image(SIDE, y + place * (side + GAP), side, view.image)
         for column, content in enumerate(pair.maps):
-            x = left + column * (wide + gap)
+            x, last = left + column * (wide + gap), number == len(pairs) - 1
             sheet.above(x + wide, y, content.title, ha="right", **ASIDE)
-            _place_map(sheet, x, y, wide, content, pair.truth, first=column == 0, last=number == len(pairs) - 1)
+            _place_map(sheet, (x, y, wide, TALL), content, pair.truth, first=column == 0, last=last)
     return sheet.figure
 
 
 def _place_map(
-    sheet: Sheet, x: float, y: float, wide: float, content: PoseMap, truth: NDArray | None, first: bool, last: bool
+    sheet: Sheet,
+    box: tuple[float, float, float, float],
+    content: PoseMap,
+    truth: NDArray | None,
+    first: bool = True,
+    last: bool = True,
 ) -> None:
     """A small map without its title, labelled where it is the first of its row and in the last one."""
-    axes = sheet.axes(x, y, wide, TALL)
-    draw_map(axes, content._replace(title=""), truth, small=True)
-    axes.tick_params(labelleft=first, labelbottom=last)
+    axes = sheet.axes(*box)
+    draw_map(axes, content._replace(title=""), truth)
+    axes.set(xticks=[0, 90, 180, 270], yticks=[-30, 0, 30])
+    axes.tick_params(pad=2, labelleft=first, labelbottom=last)
+    small_marks(axes)
     axes.set_ylabel("latitude" if first else "", labelpad=0)
     axes.set_xlabel("longitude" if last else "", labelpad=1)
