@@ -219,15 +219,25 @@ def test_the_prior_that_ships_draws_the_embedded_objects(lp, tmp_path):
         ("latitudes_degrees=20", "latitudes_degrees must list different angles between -180 and 180, got 20"),
         ("latitudes_degrees=[low]", "latitudes_degrees must list different angles between -180 and 180, got ['low']"),
         ("seed=-1", "seed must be a whole number between 0 and 2^32 - 1, got -1"),
-        ("steps=0", "steps must be a whole number, at least 1, got 0"),
-        ("steps=2.5", "steps must be a whole number, at least 1, got 2.5"),
-        ("guidance=-1", "guidance must be a number, not negative, got -1"),
-        ("eta=1.5", "eta must lie in [0, 1], got 1.5"),
+        ("steps=2.5", "steps=2.5 does not fit; expected int"),
         ("accelerator=tpu", "accelerator=tpu is not available on this machine; choose auto or cpu"),
     ],
 )
 def test_mistakes(draw, lp, setting, sentence):
     assert mistake(draw, lp, setting).startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("steps=0", "steps must lie between 1 and 1000, got 0"),
+        ("guidance=-1", "guidance must not be negative, got -1"),
+        ("eta=1.5", "eta must lie in [0, 1], got 1.5"),
+    ],
+)
+def test_the_prior_says_which_sampling_there_is(lp, tmp_path, setting, sentence):
+    disc().save(tmp_path / "disc.png")
+    assert lp("views", "image=disc.png", "longitudes=1", setting).error.startswith(sentence)
 
 
 def test_an_image_without_background_is_told_what_to_do(draw, lp, tmp_path):

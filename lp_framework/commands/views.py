@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,19 +24,13 @@ from lp_framework.data.photographs import on_white, prepare, prepared_photograph
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
+from lp_framework.registry import checked
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.style import save_figure
 from lp_framework.viz.views import views_figure
 
 FOLDER = "views"
-
-
-class Source(NamedTuple):
-    """What is turned: its file, its name, and the prepared image (RGBA)."""
-
-    file: Path
-    name: str
-    image: Image.Image
+Source = tuple[Path, str, Image.Image]  # what is turned: its file, its name, and the prepared image (RGBA)
 
 
 @orderly_console()
@@ -45,40 +39,37 @@ def run(config: DictConfig) -> None:
     folder = run_folder()
     seed_run(config.seed)
     latitudes, longitudes = angles(config.latitudes_degrees, config.longitudes)
-    check_sampling(config.steps, config.guidance, config.eta)
+    sampling = checked(Prior.generate, {key: config[key] for key in ("steps", "guidance", "eta")}, "")
     device = choose_device(config.accelerator)
     components = Components(plain(config))
-    source = photograph(config) if config.image is not None else data_view(config, components["data"])
+    file, name, image = photograph(config) if config.image is not None else data_view(config, components["data"])
     prior: Prior = components["prior"].to(device)
     poses = grid(latitudes, longitudes)  # [rows, columns, 3]
-    code = prior.encode(image_batch([source.image]).to(device))
-    sampling = (config.steps, config.guidance, config.seed, config.eta)
+    code, columns = prior.encode(image_batch([image]).to(device)), poses.transpose(0, 1).flatten(0, 1)
     with shown_progress():  # a column at once
-        images = generated_views(prior, code, poses.transpose(0, 1).flatten(0, 1), *sampling, batch=len(latitudes))
-    views = np.rint(255 * images).astype(np.uint8).reshape(len(longitudes), len(latitudes), *images.shape[1:])
+        drawn = generated_views(prior, code, columns, seed=config.seed, batch=len(latitudes), **sampling)
+    views = np.rint(255 * drawn).astype(np.uint8).reshape(len(longitudes), len(latitudes), *drawn.shape[1:])
     views = views.swapaxes(0, 1)  # [rows, columns, h, w, 3]
 
     (folder / FOLDER).mkdir(exist_ok=True)
-    save_png(folder / "source.png", source.image)
-    records = []
-    for row, latitude in enumerate(latitudes):
-        for column, longitude in enumerate(longitudes):
-            file = f"{FOLDER}/{file_name(latitude, longitude)}"
-            save_png(folder / file, Image.fromarray(views[row, column]))
-            records.append(
-                {
-                    "file": file,
-                    "relative_latitude_degrees": latitude,
-                    "relative_longitude_degrees": round(longitude, 6),
-                    "relative_pose": [round(value, 6) for value in poses[row, column].tolist()],
-                }
-            )
-    record = {"source": str(source.file), "views": records, "seed": config.seed}
+    save_png(folder / "source.png", image)
+    records: list[dict[str, Any]] = [
+        {
+            "file": f"{FOLDER}/{file_name(latitude, longitude)}",
+            "relative_latitude_degrees": latitude,
+            "relative_longitude_degrees": round(longitude, 6),
+            "relative_pose": [round(value, 6) for value in pose],
+        }
+        for latitude, row in zip(latitudes, poses.tolist(), strict=True)
+        for longitude, pose in zip(longitudes, row, strict=True)
+    ]
+    for each, view in zip(records, views.reshape(-1, *views.shape[2:]), strict=True):
+        save_png(folder / each["file"], Image.fromarray(view))
+    record = {"source": str(file), "views": records, "seed": config.seed}
     write_json(folder / "views.json", {**record, "config": plain(config), "versions": versions()})
     settings = f"steps {config.steps}, guidance {config.guidance:g}, eta {config.eta:g}, seed {config.seed}"
     note = f"prior {config.prior.name}, {settings}"
-    figure = views_figure(on_white(source.image), views, latitudes, longitudes, source.name, note)
-    save_figure(figure, folder / "views")
+    save_figure(views_figure(on_white(image), views, latitudes, longitudes, name, note), folder / "views")
     console = Console(soft_wrap=True, highlight=False)
     console.print(f"views:   {folder / FOLDER} ({len(records)} files)")
     console.print(f"poses:   {folder / 'views.json'}")
@@ -96,16 +87,6 @@ def angles(latitudes: Sequence[float], count: int) -> tuple[list[float], list[fl
     return [float(each) for each in chosen], [360 * number / count for number in range(count)]
 
 
-def check_sampling(steps: int, guidance: float, eta: float) -> None:
-    """`UserError` for settings of DDIM that no prior has; what a prior allows beyond that it says itself."""
-    if not isinstance(steps, int) or steps < 1:
-        raise UserError(f"steps must be a whole number, at least 1, got {steps}")
-    if not isinstance(guidance, int | float) or not 0 <= guidance < float("inf"):
-        raise UserError(f"guidance must be a number, not negative, got {guidance}")
-    if not isinstance(eta, int | float) or not 0 <= eta <= 1:
-        raise UserError(f"eta must lie in [0, 1], got {eta}")
-
-
 def grid(latitudes: Sequence[float], longitudes: Sequence[float]) -> Tensor:
     """Relative poses `[rows, columns, 3]` (radians, radius 0) of angles in degrees."""
     degrees = torch.cartesian_prod(*(torch.tensor(each, dtype=torch.float64) for each in (latitudes, longitudes)))
@@ -117,7 +98,7 @@ def photograph(config: DictConfig) -> Source:
     """The file that `image` names, prepared as a photograph is."""
     file = Path(config.image)
     (image,) = prepared_photographs([file], config.masks, config.remove_background, config.crop)
-    return Source(file, file.name, image)
+    return file, file.name, image
 
 
 def data_view(config: DictConfig, data: PairDataModule) -> Source:
@@ -125,7 +106,7 @@ def data_view(config: DictConfig, data: PairDataModule) -> Source:
     data.evaluate_on("ordered", config.seed)
     data.prepare_data()
     file = data.table("test").objects[object_index(data, str(config.object))].files[0]
-    return Source(file, words(config.object), prepare(read_image(file), str(file), crop=False))
+    return file, words(config.object), prepare(read_image(file), str(file), crop=False)
 
 
 def file_name(latitude: float, longitude: float) -> str:

@@ -40,10 +40,11 @@ def viewpoint(latitude: float, longitude: float) -> NDArray:
 def best_viewpoint(poses: NDArray) -> NDArray:
     """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart.
 
-    That is where equal charges, at each camera, where its image is drawn, and at the object, would have least energy.
+    That is where charges, one at each camera, one where its image is drawn, and four at the object, would have least
+    energy.
     """
     centres = _cameras(poses)[:, :3, 3]
-    points = np.concatenate([np.zeros((1, 3)), centres, centres * (1 - NEAR_BY)])
+    points = np.concatenate([np.zeros((4, 3)), centres, centres * (1 - NEAR_BY)])
     elevation = math.radians(ELEVATION)
     viewpoints = [viewpoint(elevation, poses[0, 1] + math.radians(offset)) for offset in OFFSETS]
     return min(viewpoints, key=lambda axes: np.sum(1 / (pdist(points @ axes[:, :2], "sqeuclidean") + 1e-6)).round(6))

@@ -177,7 +177,7 @@ def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
 
 # Inches: the page's width, margins, and the room between images and maps for labels; the maps' colour bar.
 WIDTH, SIDE, TOP, LABELS, BAR = 8.0, 0.1, 0.74, 0.62, 0.78
-BELOW, BETWEEN, CAPTION = 0.66, 0.3, 0.2  # the maps' labels and their key; between maps; a line above an image
+BELOW, BETWEEN, CAPTION = 0.66, 0.38, 0.2  # the maps' labels and their key; between maps; a line above an image
 IMAGE, LARGEST_VIEW = 1.72, 1.2  # sides
 
 
@@ -201,8 +201,9 @@ def pair_figure(
     sheet = Sheet(WIDTH, TOP + content + SIDE)
     sheet.head(title, note)
     sheet.image(SIDE, TOP, IMAGE, pair.reference.image, "reference")
-    sheet.image(SIDE, TOP + content - IMAGE, IMAGE, pair.query.image, "query")
     top = TOP + (content - below) / 2
+    lower = top + high + BETWEEN if len(maps) > 1 else TOP + content - IMAGE
+    sheet.image(SIDE, lower, IMAGE, pair.query.image, "query")
     for row, each in enumerate(maps):
         axes = sheet.axes(left, top + row * (high + BETWEEN), wide, high)
         drawn = draw_map(axes, each, pair.truth, limit)

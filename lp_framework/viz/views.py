@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from lp_framework.viz.style import FAINT, TRUTH, Sheet, styled
+from lp_framework.viz.style import TRUTH, Sheet, styled
 
 # Inches: the figure's width, margins, the room for the latitudes, and the sides of the source and of the largest view.
 WIDTH, SIDE, TOP, BOTTOM, LABELS, SOURCE, LARGEST = 10.0, 0.1, 0.74, 0.42, 0.62, 1.8, 1.6
@@ -37,32 +37,19 @@ def views_figure(
     sheet = Sheet(left + wide + SIDE, TOP + tall + BOTTOM)
     sheet.head(title, note)
     sheet.image(SIDE, TOP, SOURCE, source, "source")
-    axes = sheet.axes(left, TOP, wide, high)
-    # Data coordinates are those of cells: the centre of row r and column c is (c, r).
-    axes.imshow(
-        contact_sheet(views), interpolation="antialiased", extent=(-0.5, columns - 0.5, rows - 0.5, -0.5), aspect="auto"
-    )
-    every = -(-columns // MOST_LABELS)
-    axes.set_xticks(range(0, columns, every), [f"{angle:.4g}°" for angle in longitudes_degrees[::every]])
-    axes.set_yticks(range(rows), [signed(angle) for angle in latitudes_degrees])
-    axes.tick_params(length=0, pad=4)
-    axes.spines[:].set_visible(False)
-    axes.vlines(np.arange(1, columns) - 0.5, -0.5, rows - 0.5, color=FAINT, linewidth=0.5)
-    axes.hlines(np.arange(1, rows) - 0.5, -0.5, columns - 0.5, color=FAINT, linewidth=0.5)
-    frames = [((-0.5, -0.5), columns, rows, FAINT, 0.8)]
-    own = np.isclose(np.asarray(latitudes_degrees)[:, None], 0) & np.isclose(np.asarray(longitudes_degrees) % 360, 0)
-    frames += [((column - 0.5, row - 0.5), 1, 1, TRUTH, 1.6) for row, column in np.argwhere(own)]
-    for *box, colour, thick in frames:
-        axes.add_patch(Rectangle(*box, fill=False, edgecolor=colour, linewidth=thick, clip_on=False, zorder=2 + thick))
-    axes.set_xlabel("longitude relative to the source")
-    axes.set_ylabel("latitude")
+    for row, latitude in enumerate(latitudes_degrees):
+        y = TOP + row * cell
+        sheet.text(left - 0.06, y + cell / 2, signed(latitude), ha="right", va="center")
+        for column, longitude in enumerate(longitudes_degrees):
+            own = math.isclose(latitude, 0) and math.isclose(longitude % 360, 0)
+            frame: Any = {"color": TRUTH, "linewidth": 1.6} if own else {"linewidth": 0.5}
+            sheet.image(left + column * cell, y, cell, views[row, column], **frame).set_zorder(1 + own)
+    for column in range(0, columns, -(-columns // MOST_LABELS)):
+        x = left + (column + 0.5) * cell
+        sheet.text(x, TOP + high + 0.06, f"{longitudes_degrees[column]:.4g}°", ha="center", va="top")
+    sheet.text(left + wide / 2, TOP + high + 0.22, "longitude relative to the source", ha="center", va="top")
+    sheet.text(left - 0.52, TOP + high / 2, "latitude", rotation=90, ha="center", va="center")
     return sheet.figure
-
-
-def contact_sheet(views: NDArray) -> NDArray:
-    """One image `[rows h, columns w, 3]` of views `[rows, columns, h, w, 3]`."""
-    rows, columns, height, width, channels = views.shape
-    return views.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, channels)
 
 
 def signed(angle: float) -> str:
