@@ -42,8 +42,8 @@ def test_a_profile_is_centred_on_the_truth():
     curve = profile(energies, AZIMUTHS, truth)
     assert curve.degrees.tolist() == [float(15 * k) for k in range(-12, 12)]
     first, second = curve.minima()
-    assert first.degrees == 0 and first.height == 0
-    assert abs(second.degrees) == 180 and 0 < second.height < 1
+    assert first == {"degrees": 0, "height": 0}
+    assert abs(second["degrees"]) == 180 and 0 < second["height"] < 1
 
 
 @given(st.integers(1, 5), st.floats(-180, 180))
@@ -56,6 +56,6 @@ def test_the_minima_of_a_wave_are_counted(waves, phase):
 def test_a_dent_is_no_minimum_and_a_flat_profile_has_no_relief():
     degrees = torch.arange(-180.0, 180.0, 15.0)
     dented = Profile(degrees, 2 - degrees.deg2rad().cos() - 0.05 * (degrees == 120))
-    assert [minimum.degrees for minimum in dented.minima()] == [0.0]
+    assert [minimum["degrees"] for minimum in dented.minima()] == [0.0]
     assert dented.relief == pytest.approx(1.0, abs=0.01)
     assert Profile(degrees, torch.ones(24)).relief == 0

@@ -22,12 +22,12 @@ from lp_framework.analysis.fields import (
     Draws,
     ExactModel,
     field_error,
+    generated_views,
     model_arrows,
     pose_energies,
     prior_field,
     prior_landscapes,
 )
-from lp_framework.analysis.generated import generated_views
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
 from lp_framework.analysis.pairs import named_pairs, truths
 from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View

@@ -17,9 +17,8 @@ from PIL import Image
 
 from lp_framework.analysis.landscapes import Landscape
 from lp_framework.analysis.shown import PRIOR_ENERGY, PoseMap, ShownPair, View
-from lp_framework.viz.maps import RELIEF, draw_map, pair_figure
+from lp_framework.viz.maps import RELIEF, draw_map, pair_figure, surface_figure
 from lp_framework.viz.style import ANSWER, save_figure
-from lp_framework.viz.surface import surface_figure
 
 PICTURES = Path(__file__).parent / "pictures"
 LANDSCAPE = wells((10, 50, 1.0), (-20, 230, 0.7), width=3.0)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -51,13 +52,6 @@ def within(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Tensor:
     return wrap_angle(best - truth).abs() <= math.radians(NEAR_DEGREES)
 
 
-class Minimum(NamedTuple):
-    """A local minimum of a profile: its place (degrees from the truth) and its height in the profile's range."""
-
-    degrees: float
-    height: float
-
-
 class Profile(NamedTuple):
     """The mean energy around an object `[A]` over the azimuth's distance from the truth `[A]` (degrees, -180 first)."""
 
@@ -69,10 +63,13 @@ class Profile(NamedTuple):
         """Its range over its mean: next to 0 where the energy does not tell the azimuth."""
         return ((self.energy.max() - self.energy.min()) / self.energy.mean()).item()
 
-    def minima(self) -> list[Minimum]:
-        """Its local minima, the deepest first; a dent of less than `PROMINENCE` of the range does not count."""
+    def minima(self) -> list[dict[str, float]]:
+        """Its local minima, the deepest first: `degrees` from the truth, and `height` in the profile's range.
+
+        A dent of less than `PROMINENCE` of the range does not count.
+        """
         found = valleys(self.energy[None], PROMINENCE)
-        return [Minimum(self.degrees[cell].item(), height) for cell, height, _ in found]
+        return [{"degrees": self.degrees[cell].item(), "height": height} for cell, height, _ in found]
 
 
 def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:
@@ -106,7 +103,7 @@ class Ambiguity(NamedTuple):
         """`continuous`: the floor is flat. Else by its valleys: one, a second one half a turn away, or other ones."""
         if self.flatness >= FLAT:
             return "continuous"
-        places = [minimum.degrees for minimum in self.floor.minima()]
+        places = [minimum["degrees"] for minimum in self.floor.minima()]
         if len(places) == 1:
             return "unique"
         apart = abs(places[1] - places[0])
@@ -115,7 +112,7 @@ class Ambiguity(NamedTuple):
     @property
     def unique_answer(self) -> bool:
         """Whether one longitude is better than all others: the floor is not flat, and its valleys differ in depth."""
-        return self.verdict != "continuous" and sum(each.height < EQUAL for each in self.floor.minima()) == 1
+        return self.verdict != "continuous" and sum(each["height"] < EQUAL for each in self.floor.minima()) == 1
 
     def record(self) -> dict[str, object]:
         """As plain values."""
@@ -123,7 +120,7 @@ class Ambiguity(NamedTuple):
             "verdict": self.verdict,
             "unique_answer": self.unique_answer,
             "flatness": self.flatness,
-            "valleys": [minimum._asdict() for minimum in self.floor.minima()] if self.flatness < FLAT else [],
+            "valleys": self.floor.minima() if self.flatness < FLAT else [],
             "minima": self.minima,
         }
 
@@ -140,38 +137,33 @@ def ambiguity(landscapes: Sequence[Landscape], truth: Tensor) -> Ambiguity:
 
 
 def overview(
-    data: PairDataModule, prior: Prior, device: torch.device, draws: Draws, grid: Grid, azimuths: int
+    data: PairDataModule, prior: Prior, device: torch.device, draws: Draws, grid: Grid, azimuths: int, protocol: str
 ) -> dict[str, Any]:
     """`objects`, a row an object, and the shares of pairs whose least energy is at the truth, as plain values.
 
-    `azimuths` of them around each pair that the data were told to evaluate on (`evaluate_on`), with latitude and radius
-    true; the ambiguity by landscapes over `grid` of up to `PAIRS` pairs of the protocol `per_view`.
+    `azimuths` of them around each pair of the protocol, on which the data evaluate, with latitude and radius true; the
+    ambiguity by landscapes over `grid` of up to `PAIRS` pairs of the protocol `per_view`.
     """
     split = data.evaluation_split()
-    table, batches = data.table(split), data.data(split)
+    table, views = data.table(split), data.data(split)
     places = torch.arange(azimuths) * (2 * math.pi / azimuths)
-    energies, truth, objects = [], [], []
-    for batch in tracked(list(data.test_dataloader()), "energies around the objects"):
-        poses, pairs = batch.relative_poses(), pairs_of(batch, device)
-        energies.append(azimuth_energies(prior, pairs, poses.to(device), places, draws).cpu())
-        truth.append(poses[:, 1])
-        objects.append(batch.objects[batch.reference])
-    energy, longitude, index = torch.cat(energies), torch.cat(truth), torch.cat(objects)
-    near = within(energy, places, longitude)
-    per_view = table.pairs("per_view", draws.seed)  # a row a view
+    every, per_view = (table.pairs(each, draws.seed) for each in (protocol, "per_view"))
     rows: list[dict[str, Any]] = []
-    for number in tracked(range(len(table.names)), "ambiguity of the objects"):
-        mask = index == number
-        curve = profile(energy[mask], places, longitude[mask])
-        batch = batches[per_view[table.views_of(number)[:PAIRS]]]
+    for number in tracked(range(len(table.names)), "energies around the objects"):
+        batch = views[every[np.isin(every[:, 0], table.views_of(number))]]
+        true = batch.relative_poses()
+        energy = azimuth_energies(prior, pairs_of(batch, device), true.to(device), places, draws).cpu()
+        curve = profile(energy, places, true[:, 1])
+        near = within(energy, places, true[:, 1])
+        batch = views[per_view[table.views_of(number)[:PAIRS]]]  # a row a view
         true = batch.relative_poses()
         landscapes = prior_landscapes(prior, pairs_of(batch, device), true[:, 2], grid, draws)
         rows.append(
             {
                 "object": table.names[number], "ambiguity": table.ambiguities[number],
                 "unique_answer": table.unique_answer[number],
-                "pairs": int(mask.sum()), "within": near[mask].double().mean().item(),
-                "relief": curve.relief, "minima": [minimum._asdict() for minimum in curve.minima()],
+                "pairs": len(near), "within": near.double().mean().item(),
+                "relief": curve.relief, "minima": curve.minima(),
                 "degrees": curve.degrees.tolist(), "energy": curve.energy.tolist(),
                 "ambiguity_score": ambiguity(landscapes, true[:, 1]).record(),
             }

@@ -1,18 +1,20 @@
-"""Energies and scores over relative poses: of a prior, of a model, and of the kernel that a model learns."""
+"""Over relative poses: a prior's energies, scores and views, a model's fields, and those of the kernel it learns."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lp_framework.analysis.landscapes import Arrows, Grid, Landscape, cell_grid
 from lp_framework.errors import UserError
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.models.pose_model import FieldValue, PoseModel
-from lp_framework.priors.base import Prior
+from lp_framework.priors.base import Prior, ViewCode
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
@@ -134,6 +136,31 @@ def prior_field(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Fiel
         scores.append(-gradient / len(steps))
         energies.append(total / len(steps))
     return FieldValue(torch.cat(scores, dim=1), torch.cat(energies, dim=1))
+
+
+@torch.no_grad()
+def generated_views(
+    prior: Prior,
+    source: ViewCode,
+    poses: Tensor,
+    steps: int,
+    guidance: float,
+    seed: int,
+    eta: float = 1.0,
+    batch: int = 16,
+) -> NDArray:
+    """Views `[N, H, W, 3]` in [0, 1] of one image's code under relative poses `[N, 3]`, by DDIM, `batch` at once.
+
+    All have the same draws, so that they differ by their poses alone.
+    """
+    parts = []
+    for number in steps_of(math.ceil(len(poses) / batch), "generated views"):
+        generator = torch.Generator().manual_seed(seed)  # on the CPU: a GPU gets the same draws
+        pose = poses[number * batch : (number + 1) * batch].to(source.latent)
+        repeated = source[torch.zeros(len(pose), dtype=torch.int64, device=pose.device)]
+        parts.append(prior.generate(repeated, pose, steps, guidance, generator, eta).float().cpu())
+    views: NDArray = ((torch.cat(parts) + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy()
+    return views
 
 
 # ---------------------------------------------------------------- models

@@ -18,12 +18,12 @@ from torch import Tensor
 from lp_framework.analysis.fields import (
     Draws,
     ExactModel,
+    generated_views,
     model_arrows,
     model_field,
     model_landscapes,
     prior_landscapes,
 )
-from lp_framework.analysis.generated import generated_views
 from lp_framework.analysis.landscapes import Grid, Landscape, landscape_grid
 from lp_framework.analysis.shown import PRIOR_ENERGY, PoseMap, ShownPair, View
 from lp_framework.data.module import PairDataModule

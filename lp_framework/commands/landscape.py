@@ -43,9 +43,8 @@ from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.viz.azimuth import azimuth_figure
-from lp_framework.viz.maps import minima_in_words, pair_figure
+from lp_framework.viz.maps import minima_in_words, pair_figure, surface_figure
 from lp_framework.viz.style import save_figure
-from lp_framework.viz.surface import surface_figure
 
 OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview has no use for
 
@@ -66,7 +65,7 @@ def run(config: DictConfig) -> None:
         data = components["data"]
         data.evaluate_on(config.protocol, config.seed)
         data.prepare_data()
-        record = overview(data, components["prior"].to(device), device, draws, grid, config.azimuths)
+        record = overview(data, components["prior"].to(device), device, draws, grid, config.azimuths, config.protocol)
         write_overview(console, config, folder, record)
     else:
         if config.images is not None:

@@ -13,7 +13,7 @@ from PIL import Image
 from rich.console import Console
 from torch import Tensor
 
-from lp_framework.analysis.generated import generated_views
+from lp_framework.analysis.fields import generated_views
 from lp_framework.analysis.pairs import object_index
 from lp_framework.analysis.shown import words
 from lp_framework.api import image_batch

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.analysis.generated import generated_views
+from lp_framework.analysis.fields import generated_views
 from lp_framework.analysis.landscapes import landscape_grid
 from lp_framework.analysis.pairs import object_index, solved_pairs, with_prior_energy
 from lp_framework.analysis.shown import ShownPair

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from lp_framework.analysis.landscapes import Landscape
 from lp_framework.analysis.shown import PoseMap, ShownPair
-from lp_framework.viz.maps import draw_map, errors_in_words, minima_in_words, small_marks, start_names
+from lp_framework.viz.maps import draw_map, errors_in_words, minima_in_words, small_marks, small_surface, start_names
 from lp_framework.viz.style import ANSWER, ASIDE, INK, Sheet, letter, styled
-from lp_framework.viz.surface import small_surface
 
 WIDTH, SIDE, TITLE, GAP = 7.0, 0.06, 0.24, 0.05  # inches: the figure's width and margin, room for a title, gaps
 COLUMNS = 3  # of surfaces
