@@ -15,11 +15,18 @@ elif [ -f "$run/checkpoints/last.ckpt" ] && [ $# -eq 0 ]; then
 else
     echo "quickstart: rendering the embedded objects and training (about 5 minutes on 2 cores)"
     rm -rf "$run"
-    $python -m lp_framework train "hydra.run.dir=$run" "$@"
+    # While the training compiles PyTorch, which it imports first, another core compiles what it needs next.
+    $python -c "import hydra.main, scipy.spatial, trimesh, plotly.offline, matplotlib.pyplot" &
+    $python -m lp_framework train "hydra.run.dir=$run" logger.tensorboard=false "$@"
 fi
 echo
-echo "quickstart: the first stage alone, without noise (gamma 0)"
-$python -m lp_framework eval "checkpoint=$run" solver.gamma=0 pictures=false "hydra.run.dir=$run/eval_first_stage"
-echo
-echo "quickstart: both stages, the second one on the prior that ships"
+echo "quickstart: evaluating both stages, the second one on the prior that ships, and the first one alone"
+first="$run/eval_first_stage"  # on another core meanwhile
+mkdir -p "$first"
+OMP_NUM_THREADS=1 $python -m lp_framework eval "checkpoint=$run" solver.gamma=0 pictures=false "hydra.run.dir=$first" \
+    > "$first/printed.txt" &
 $python -m lp_framework eval "checkpoint=$run" solver=two_stage solver.gamma=0 "hydra.run.dir=$run/eval_two_stage"
+wait $!
+echo
+echo "quickstart: the first stage alone"
+cat "$first/printed.txt"
