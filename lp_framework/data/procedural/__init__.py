@@ -1,8 +1,8 @@
 """Procedural objects without end: textured things as they stand about a house, each made from two numbers.
 
-Read from the bottom up: `textures` (colours, patterns, pictures) and `labels` (prints of packages), `shapes`, then the
-families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which picks the family. `source` is the choice
-`data=procedural`.
+Read from the bottom up: `paint` and `solids`, `textures` (colours, patterns, pictures), `labels` (prints of packages)
+and `shapes`, then the families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which picks the family.
+`source` is the choice `data=procedural`.
 """
 
 from __future__ import annotations

@@ -7,19 +7,9 @@ from numpy.random import Generator
 from PIL import Image
 
 from lp_framework.data.procedural.labels import brand, panel
+from lp_framework.data.procedural.paint import pen, plain
 from lp_framework.data.procedural.shapes import Parts, around, body, handle, pair, stick, vessel
-from lp_framework.data.procedural.textures import (
-    chance,
-    colour,
-    colour_at,
-    frieze,
-    ground,
-    ink,
-    material,
-    pick,
-    picture,
-)
-from lp_framework.data.toy.shapes import (
+from lp_framework.data.procedural.solids import (
     Array,
     arc,
     box,
@@ -31,7 +21,17 @@ from lp_framework.data.toy.shapes import (
     rod,
     tube,
 )
-from lp_framework.data.toy.textures import pen, plain
+from lp_framework.data.procedural.textures import (
+    chance,
+    colour,
+    colour_at,
+    frieze,
+    ground,
+    ink,
+    material,
+    pick,
+    picture,
+)
 
 GLAZES = ("white", "white", "white", "pale", "vivid", "deep", "brown", "grey", "black")
 

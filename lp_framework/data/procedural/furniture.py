@@ -6,10 +6,10 @@ import numpy as np
 from numpy.random import Generator
 from PIL import Image
 
+from lp_framework.data.procedural.paint import plain
 from lp_framework.data.procedural.shapes import Parts, board, four, pair
+from lp_framework.data.procedural.solids import both, box, curve, cylinder, joined, lathe, rod, tube
 from lp_framework.data.procedural.textures import chance, colour, material, pick
-from lp_framework.data.toy.shapes import both, box, curve, cylinder, joined, lathe, rod, tube
-from lp_framework.data.toy.textures import plain
 
 
 def timber(random: Generator) -> Image.Image:

@@ -7,10 +7,10 @@ from numpy.random import Generator
 from PIL import Image
 
 from lp_framework.data.procedural.labels import brand, four_sides, panel
+from lp_framework.data.procedural.paint import plain
 from lp_framework.data.procedural.shapes import Parts, around, body, box_sheet, handle, stick
+from lp_framework.data.procedural.solids import box, cylinder, loft, plan
 from lp_framework.data.procedural.textures import chance, colour, ground, heap, ink, material, pick
-from lp_framework.data.toy.shapes import box, cylinder, loft, plan
-from lp_framework.data.toy.textures import plain
 
 
 def printed_box(random: Generator, alike: bool = False) -> Parts:

@@ -11,8 +11,8 @@ from numpy.random import Generator
 from PIL import Image, ImageFont
 
 from lp_framework.data.procedural import textures as tx
+from lp_framework.data.procedural.paint import Colour, pen, shade, star
 from lp_framework.data.procedural.textures import chance, colour, pick
-from lp_framework.data.toy.textures import Colour, pen, shade, star
 
 # All of matplotlib.
 FONTS = """DejaVuSans-Bold DejaVuSans-BoldOblique DejaVuSans DejaVuSerif-Bold DejaVuSerif-BoldItalic DejaVuSansMono-Bold

@@ -15,8 +15,8 @@ from trimesh.visual.material import PBRMaterial
 from lp_framework.data.meshes import Ambiguity, MeshObject
 from lp_framework.data.procedural import crockery, furniture, groceries, things
 from lp_framework.data.procedural.shapes import Parts
+from lp_framework.data.procedural.solids import scene
 from lp_framework.data.procedural.textures import pick
-from lp_framework.data.toy.shapes import scene
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The shapes that recur in things about the house, made of those that the embedded objects are built from.
+"""The shapes that recur in things about the house, made of `solids`.
 
 As there, +Y is up and the middle of a texture that goes around faces +Z.
 """
@@ -12,7 +12,18 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
-from lp_framework.data.toy.shapes import Array, Shape, arc_length, box, curve, ellipsoid, hollow, lathe, loft, tube
+from lp_framework.data.procedural.solids import (
+    Array,
+    Shape,
+    arc_length,
+    box,
+    curve,
+    ellipsoid,
+    hollow,
+    lathe,
+    loft,
+    tube,
+)
 
 Parts = list[tuple[Shape, Image.Image]]  # an object: its shapes, each with the texture that it wears
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.random import Generator
 from PIL import Image
 
-from lp_framework.data.toy.shapes import curve
-from lp_framework.data.toy.textures import Colour, noise, painted, pen, plain, shade, wood
+from lp_framework.data.procedural.paint import Colour, noise, painted, pen, plain, shade, wood
+from lp_framework.data.procedural.solids import curve
 
 Choice = TypeVar("Choice")
 

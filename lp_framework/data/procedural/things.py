@@ -7,9 +7,9 @@ from numpy.random import Generator
 from PIL import Image
 
 from lp_framework.data.procedural.labels import brand, letter, panel
+from lp_framework.data.procedural.paint import pen, plain, wheel_paint
 from lp_framework.data.procedural.shapes import Parts, body, box_sheet, dented, four, handle, lump, pair
-from lp_framework.data.procedural.textures import chance, colour, ground, ink, material, pick
-from lp_framework.data.toy.shapes import (
+from lp_framework.data.procedural.solids import (
     Shape,
     arc,
     box,
@@ -25,7 +25,7 @@ from lp_framework.data.toy.shapes import (
     tube,
     wheel,
 )
-from lp_framework.data.toy.textures import pen, plain, wheel_paint
+from lp_framework.data.procedural.textures import chance, colour, ground, ink, material, pick
 
 
 def book(random: Generator) -> Parts:

@@ -58,7 +58,7 @@ class RenderedData(ViewSource):
 
 @register("data", "toy")
 class ToyData(RenderedData):
-    """Twelve embedded objects that this package makes: six unique, three twofold, three continuous."""
+    """Twelve embedded objects that ship with this package: six unique, three twofold, three continuous."""
 
     def __init__(
         self,

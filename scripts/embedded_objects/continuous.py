@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from lp_framework.data.toy import textures as tx
-from lp_framework.data.toy.shapes import curve, hollow, lathe, scene, torus
+from embedded_objects import textures as tx
+from lp_framework.data.procedural.solids import curve, hollow, lathe, scene, torus
 
 
 def soup_can() -> trimesh.Scene:

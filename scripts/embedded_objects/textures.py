@@ -1,4 +1,4 @@
-"""Painted textures: a palette, grained and patterned grounds, lettering, and the sheets that boxes and slabs wear."""
+"""Painted textures: a palette, patterned grounds, lettering, and the sheets that boxes and slabs wear."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ from collections.abc import Iterator, Sequence
 from itertools import chain, product
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-Colour = tuple[int, int, int]
+from lp_framework.data.procedural.paint import Colour, mottle, pen, shade, wood
+from lp_framework.data.procedural.paint import bands as bands
+from lp_framework.data.procedural.paint import painted as painted
+from lp_framework.data.procedural.paint import plain as plain
+from lp_framework.data.procedural.paint import star as star
+from lp_framework.data.procedural.paint import wheel_paint as wheel_paint
 
 CREAM: Colour = (242, 226, 190)
 RED: Colour = (200, 58, 44)
@@ -32,24 +36,6 @@ WHITE: Colour = (250, 246, 236)
 GLASS: Colour = (64, 92, 112)
 
 
-def plain(colour: Colour) -> Image.Image:
-    """A texture of one colour."""
-    return Image.new("RGB", (8, 8), colour)
-
-
-def shade(colour: Colour, factor: float) -> Colour:
-    """The colour made darker (`factor` < 1) or, towards white, lighter (`factor` > 1)."""
-    goal = 0 if factor < 1 else 255
-    weight = abs(factor - 1)
-    r, g, b = (round(c + (goal - c) * weight) for c in colour)
-    return r, g, b
-
-
-def pen(image: Image.Image) -> ImageDraw.ImageDraw:
-    """A pen to draw on the image."""
-    return ImageDraw.Draw(image)
-
-
 def canvas(
     width: int, height: int, colour: Colour, strength: float = 0.0, seed: int = 0, cells: int = 12
 ) -> tuple[Image.Image, ImageDraw.ImageDraw]:
@@ -58,41 +44,6 @@ def canvas(
     if strength:
         image = mottle(image, strength, seed, cells)
     return image, pen(image)
-
-
-def noise(width: int, height: int, columns: int, rows: int, seed: int) -> NDArray[np.float64]:
-    """Smooth noise `[height, width]` in about [-1, 1] from a grid of random values; its left and right edges meet."""
-    grid = np.random.default_rng(seed).uniform(-1, 1, (rows, columns)).astype(np.float32)
-    wrapped = np.concatenate([grid[:, -2:], grid, grid[:, :2]], axis=1)
-    cell = width / columns
-    area = (2 * cell, 0, 2 * cell + width, rows)
-    stretched = Image.fromarray(wrapped).resize((round(cell * (columns + 4)), rows), Image.Resampling.BICUBIC)
-    return np.asarray(stretched.resize((width, height), Image.Resampling.BICUBIC, box=area), dtype=np.float64)
-
-
-def mottle(image: Image.Image, strength: float = 0.08, seed: int = 0, cells: int = 12) -> Image.Image:
-    """The image with its brightness gently uneven, as paint and clay are."""
-    width, height = image.size
-    rows = max(2, round(cells * height / width))
-    coarse = noise(width, height, cells, rows, seed)
-    fine = noise(width, height, 5 * cells, 5 * rows, seed + 1)
-    gain = 1 + strength * (0.65 * coarse + 0.35 * fine)
-    return Image.fromarray((np.asarray(image, dtype=np.float64) * gain[..., None]).clip(0, 255).astype(np.uint8))
-
-
-def painted(colour: Colour, seed: int = 0, strength: float = 0.06, size: int = 256) -> Image.Image:
-    """A softly uneven ground of one colour."""
-    return mottle(Image.new("RGB", (size, size), colour), strength, seed, cells=6)
-
-
-def wood(colour: Colour, width: int = 512, height: int = 512, seed: int = 0) -> Image.Image:
-    """Wood with its grain along the width."""
-    warp = noise(width, height, 3, 6, seed)
-    rows = np.arange(height)[:, None] / height
-    rings = np.sin(2 * np.pi * (9 * rows + 1.3 * warp))
-    fibres = noise(width, height, 12, height // 3, seed + 1)
-    gain = 1 + 0.10 * rings + 0.10 * fibres
-    return Image.fromarray((np.array(colour) * gain[..., None]).clip(0, 255).astype(np.uint8))
 
 
 def planks(colour: Colour, width: int = 512, height: int = 512, rows: int = 6, seed: int = 0) -> Image.Image:
@@ -171,13 +122,6 @@ def text(
     draw.text((x, y), words, colour, font, anchor="mm", stroke_width=stroke, stroke_fill=colour)
 
 
-def star(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: Colour, points: int = 5) -> None:
-    """A star with one tip up."""
-    angle = np.arange(2 * points) * np.pi / points
-    reach = np.where(np.arange(2 * points) % 2 == 0, radius, 0.42 * radius)
-    draw.polygon([(x + r * np.sin(a), y - r * np.cos(a)) for a, r in zip(angle, reach, strict=True)], fill=colour)
-
-
 def flower(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, petal: Colour, heart: Colour) -> None:
     """A flower of seven petals."""
     for angle in np.arange(7) * 2 * np.pi / 7:
@@ -203,17 +147,6 @@ def window(
         draw.rectangle([inner[0], inner[1] + high / 2 - rim / 3, inner[2], inner[1] + high / 2 + rim / 3], fill=frame)
 
 
-def bands(stops: list[tuple[float, Colour]], size: int = 512) -> Image.Image:
-    """Level bands, bottom to top: each colour reaches up to its fraction of the height."""
-    image = Image.new("RGB", (8, size))
-    draw = pen(image)
-    start = 0.0
-    for stop, colour in stops:
-        draw.rectangle([0, round(size * (1 - stop)), 8, round(size * (1 - start))], fill=colour)
-        start = stop
-    return image
-
-
 def box_sheet(
     front: Image.Image,
     right: Image.Image,
@@ -223,7 +156,7 @@ def box_sheet(
     bottom: Image.Image,
     cell: int = 448,
 ) -> Image.Image:
-    """The texture of `shapes.box`: six pictures, each as seen from outside (the top from above, the front below)."""
+    """The texture of `solids.box`: six pictures, each as seen from outside (the top from above, the front below)."""
     sheet = Image.new("RGB", (3 * cell, 2 * cell))
     for index, picture in enumerate((front, right, back, left, top, bottom)):
         place = (index % 3 * cell, index // 3 * cell)
@@ -232,12 +165,12 @@ def box_sheet(
 
 
 def all_sides(picture: Image.Image) -> Image.Image:
-    """The texture of `shapes.box` with one picture on its six faces."""
+    """The texture of `solids.box` with one picture on its six faces."""
     return box_sheet(picture, picture, picture, picture, picture, picture, cell=256)
 
 
 def slab_sheet(front: Image.Image, back: Image.Image, rim: Image.Image, size: int = 1024) -> Image.Image:
-    """The texture of `shapes.extrude`: front, back as seen from behind, and a strip along the rim."""
+    """The texture of `solids.extrude`: front, back as seen from behind, and a strip along the rim."""
     sheet = Image.new("RGB", (size, size))
     high = size * 3 // 4
     for column, picture in enumerate((front, back)):
@@ -254,16 +187,8 @@ def band(picture: Image.Image, start: float, stop: float, ground: Colour, size: 
     return image
 
 
-def wheel_paint(hub: Colour, tyre: Colour = DARK) -> Image.Image:
-    """Hub cap, rim and tyre, as level bands over a wheel seen from its side."""
-    cap, rim = shade(hub, 1.5), shade(hub, 0.6)
-    near = [(0.06, cap), (0.08, rim), (0.19, hub), (0.215, rim)]
-    far = [(0.81, rim), (0.92, hub), (0.94, rim), (1.0, cap)]
-    return bands([*near, (0.785, tyre), *far])
-
-
 def wrapped(front: Image.Image, right: Image.Image, back: Image.Image, left: Image.Image) -> Image.Image:
-    """Four pictures of one height side by side, as they go around a loft of `shapes.plan` rings."""
+    """Four pictures of one height side by side, as they go around a loft of `solids.plan` rings."""
     half = back.width // 2
     ends = back.crop((half, 0, back.width, back.height)), back.crop((0, 0, half, back.height))
     sheet = Image.new("RGB", (front.width + right.width + back.width + left.width, front.height))

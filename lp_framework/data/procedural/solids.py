@@ -1,4 +1,4 @@
-"""Closed surfaces to build toys from: lofts, lathes, tubes, rounded boxes and bevelled extrusions, with texture
+"""Closed surfaces to build objects from: lofts, lathes, tubes, rounded boxes and bevelled extrusions, with texture
 coordinates. +Y is up; a texture's left edge lies at the back (-Z) of a lathe, so its middle faces +Z."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from lp_framework.data.meshes import normalise
-from lp_framework.data.toy.textures import Colour, plain
+from lp_framework.data.procedural.paint import Colour, plain
 
 Array = NDArray[np.float64]
 
@@ -195,7 +195,7 @@ BOX_FACES = {  # name: (right, up, out) as seen from outside, and the cell (colu
 
 
 def box(x: float, y: float, z: float, radius: float = 0.03, steps: int = 3) -> Shape:
-    """A box of the given size with rounded edges; its texture has the six cells of `textures.box_sheet`."""
+    """A box of the given size with rounded edges; its texture has the six cells of `shapes.box_sheet`."""
     half = np.array([x, y, z]) / 2
     bulge = radius * np.tan(np.radians(np.linspace(0, 45, steps + 1)))
     shapes = []
@@ -223,7 +223,7 @@ def joined(shapes: Iterable[Shape]) -> Shape:
 def extrude(outline: ArrayLike, depth: float, bevel: float = 0.02) -> Shape:
     """A counter-clockwise outline `[N, 2]` in XY thickened to `depth` along Z, with bevelled edges.
 
-    Its texture has the cells of `textures.slab_sheet`: front, back (as seen from behind) and a strip for the rim,
+    Its texture has three cells: front, back (as seen from behind) and a strip for the rim,
     along which `u` follows the outline from its first point.
     """
     points = np.asarray(outline, dtype=np.float64)
@@ -302,7 +302,7 @@ def rounded(corners: ArrayLike, radius: float, steps: int = 5) -> Array:
 
 
 def wheel(radius: float, width: float) -> Shape:
-    """A wheel with its axle along Z, for `textures.wheel_paint`."""
+    """A wheel with its axle along Z, for `paint.wheel_paint`."""
     return cylinder(radius, width, 0.12 * radius).turn("x", 90)
 
 
