@@ -11,22 +11,22 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Literal
 
 import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from lp_framework.data.meshes import Ambiguity
 from lp_framework.errors import UserError, nearest
 
-CLASSES = tuple(name for name in get_args(Ambiguity) if name != "unlabelled")
-KEYS = ("ambiguity", "unique_answer", "reason")
 
-
-class Label(NamedTuple):
+class Label(BaseModel):
     """An object's ambiguity class and whether a view of it has one right longitude, None where the class decides."""
 
-    ambiguity: Ambiguity
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    ambiguity: Literal["unique", "twofold", "continuous"]
     unique_answer: bool | None = None
+    reason: str | None = None
 
 
 def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, Label]:
@@ -47,23 +47,12 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
     for name, label in content.items():
         if name not in names:
             raise UserError(f"{path}: {where} has no object '{name}'{nearest(str(name), names)}")
-        labels[name] = _label(label, f"{path}: object '{name}'")
+        try:
+            labels[name] = Label.model_validate(label)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = "".join(f"{each}: " for each in first["loc"])
+            raise UserError(f"{path}: object '{name}': {key}{first['msg']}, got {first['input']!r}") from error
     if left_out := sorted(set(names) - set(labels)):
         warnings.warn(f"{path}: leaves out, so that they stay unlabelled: {', '.join(left_out)}", stacklevel=2)
     return labels
-
-
-def _label(label: Any, where: str) -> Label:
-    if not isinstance(label, dict) or "ambiguity" not in label:
-        raise UserError(f"{where} needs ambiguity: {', '.join(CLASSES[:-1])} or {CLASSES[-1]}")
-    for key, value in label.items():
-        if key not in KEYS:
-            raise UserError(f"{where}: {key!r} is none of {', '.join(KEYS)}{nearest(str(key), KEYS)}")
-        if key == "ambiguity" and value not in CLASSES:
-            known = f"{', '.join(CLASSES)}{nearest(str(value), CLASSES)}"
-            raise UserError(f"{where}: ambiguity {value!r} is none of {known}")
-        if key == "unique_answer" and not isinstance(value, bool | None):
-            raise UserError(f"{where}: unique_answer must be true or false, got {value!r}")
-        if key == "reason" and not isinstance(value, str | None):
-            raise UserError(f"{where}: reason must be a text, got {value!r}")
-    return Label(label["ambiguity"], label.get("unique_answer"))

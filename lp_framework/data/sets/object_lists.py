@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,8 +20,7 @@ from lp_framework.errors import UserError
 LIST = "objects.json"
 
 
-@dataclass(frozen=True)
-class ObjectLists:
+class ObjectLists(NamedTuple):
     """Names of the objects to train on (`seen`) and of those kept for evaluation (`unseen`), each sorted."""
 
     seen: list[str]
@@ -64,7 +62,7 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
         with locked(views, ".objects.lock"):
             if not path.exists():
                 with written(path) as partial:
-                    partial.write_text(json.dumps({"chosen": how, **vars(lists)}, indent=1))
+                    partial.write_text(json.dumps({"chosen": how, **lists._asdict()}, indent=1))
     content = read_record(path)
     found, seen, unseen = content.get("chosen"), _names(content.get("seen")), _names(content.get("unseen"))
     if not isinstance(found, dict) or seen is None or unseen is None:

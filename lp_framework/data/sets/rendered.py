@@ -1,4 +1,4 @@
-"""Sources that render meshes: the embedded objects, a folder of meshes."""
+"""Sources that render meshes: the embedded objects, folders of meshes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from lp_framework.data.reading import names_below
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
 from lp_framework.data.sets.object_labels import Label, read_labels
-from lp_framework.data.sets.object_lists import drawn, kept_lists
+from lp_framework.data.sets.object_lists import ObjectLists, drawn, kept_lists
 from lp_framework.data.source import ViewSource
 from lp_framework.data.toy import toy_objects
-from lp_framework.data.views import ObjectViews
+from lp_framework.data.views import ObjectViews, object_names
+from lp_framework.errors import UserError
 from lp_framework.registry import register
 
 
@@ -90,6 +91,9 @@ class MeshData(RenderedData):
     a YAML file with their ambiguity classes (see `object_labels`).
     """
 
+    seen: int | None = None  # how many there are to train on, all but the unseen ones by default
+    renderings: Path | None = None  # a folder of views of those to train on, which are drawn by default
+
     def __init__(
         self,
         renderer: Renderer,
@@ -116,26 +120,47 @@ class MeshData(RenderedData):
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:
-        """One object a mesh file, named after it, sorted by name; of a divided folder the seen or the unseen ones."""
-        files = self._files
-        if self.unseen or self.which == "unseen":
-            names = [file.stem for file in files]
-            how = {"unseen": self.unseen, "split_seed": self.split_seed}
-            lists = kept_lists(self.path, how, lambda: drawn(names, None, self.unseen, self.split_seed, self.meshes))
-            chosen = lists.named(self.which)
-            files = [file for file in files if file.stem in chosen]
-        return [self._object(file) for file in files]
+        """The objects in use, sorted by name (see `object_lists`)."""
+        if self.seen is None and not self.unseen and self.which == "seen":
+            return [self.object(name) for name in self.available()]
+        how = {key: getattr(self, key) for key in ("seen", "unseen", "split_seed")}
+        how["renderings"] = None if self.renderings is None else self.renderings.name
+        return [self.object(name) for name in kept_lists(self.path, how, self._choose).named(self.which)]
 
-    def _object(self, file: Path) -> MeshObject:
-        label = self._labels.get(file.stem, Label("unlabelled"))
-        return MeshObject(file.stem, label.ambiguity, partial(load_scene, file), label.unique_answer)
+    def _choose(self) -> ObjectLists:
+        available = self.available()
+        if self.renderings is None:
+            return drawn(available, self.seen, self.unseen, self.split_seed, self.meshes)
+        seen = object_names(self.renderings)
+        if missing := sorted({*seen} - {*available}):
+            of_these = f"{len(missing)} of the {len(seen)} objects of {self.renderings}"
+            raise UserError(f"{self.meshes}: {of_these} are missing, such as {missing[0]}")
+        others = [name for name in available if name not in seen]
+        unseen = drawn(others, 0, self.unseen, self.split_seed, self.meshes).unseen if self.unseen else []
+        return ObjectLists(seen, unseen)
+
+    def available(self) -> list[str]:
+        """Names of the objects in the folder; `UserError`, with the files looked for, where there are none."""
+        return list(self._files)
+
+    def object(self, name: str) -> MeshObject:
+        """The object of a name."""
+        load = partial(load_scene, self._files.get(name, self.meshes / name))
+        if label := self._labels.get(name):
+            return MeshObject(name, label.ambiguity, load, label.unique_answer)
+        return MeshObject(name, "unlabelled", load)
 
     @cached_property
-    def _files(self) -> list[Path]:
+    def _files(self) -> dict[str, Path]:
         formats = sorted(f".{suffix}" for suffix in trimesh.available_formats())
-        files = (f.name for f in self.meshes.glob("*") if f.suffix.lower() in formats and f.name[0] != ".")
-        return [self.meshes / name for name in names_below(self.meshes, files, "meshes", ", ".join(formats))]
+        names = (f.name for f in self.meshes.glob("*") if f.suffix.lower() in formats and f.name[0] != ".")
+        files: dict[str, Path] = {}
+        for name in names_below(self.meshes, names, "meshes", ", ".join(formats)):
+            file = self.meshes / name
+            if files.setdefault(file.stem, file) != file:
+                raise UserError(f"{self.meshes}: several objects have the same name: {file.stem}")
+        return files
 
     @cached_property
     def _labels(self) -> dict[str, Label]:
-        return {} if self.labels is None else read_labels(self.labels, {file.stem for file in self._files}, self.meshes)
+        return {} if self.labels is None else read_labels(self.labels, self._files, self.meshes)

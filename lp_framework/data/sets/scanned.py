@@ -19,9 +19,7 @@ from trimesh.resolvers import FilePathResolver
 from lp_framework.data.meshes import MeshObject, load_scene, normalise
 from lp_framework.data.reading import expecting, names_below
 from lp_framework.data.rendering.renderer import Renderer
-from lp_framework.data.sets.object_lists import ObjectLists, drawn, kept_lists
-from lp_framework.data.sets.rendered import RenderedData
-from lp_framework.data.views import object_names
+from lp_framework.data.sets.rendered import MeshData
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -29,15 +27,12 @@ from lp_framework.registry import register
 _Z_UP_TO_Y_UP = np.eye(4)[[1, 2, 0, 3]]
 
 
-class ScannedData(RenderedData):
-    """Objects of a download, `seen` ones to train on and `unseen` ones to evaluate on; `objects` says which are in use.
-
-    The views go to `views`, by default `datasets/` and the name of the `release`.
-    """
+class ScannedData(MeshData):
+    """Objects of a download, rendered into `views`, by default `datasets/` and the name of the `release`."""
 
     release: ClassVar[str]
     what: ClassVar[str]  # there is in the download
-    meshes_of_release: ClassVar[str]  # where, as a pattern; the objects are named by the folder of the mesh's folder
+    layout: ClassVar[str]  # where the mesh of an object is, two folders below the one that has its name
 
     def __init__(
         self,
@@ -57,17 +52,15 @@ class ScannedData(RenderedData):
         depth: bool = False,
         workers: int | None = None,
     ) -> None:
-        self.meshes, self.renderings = Path(path), None if renderings is None else Path(renderings)
-        self.seen, self.unseen, self.which, self.split_seed = seen, unseen, objects, split_seed
         super().__init__(
-            renderer, views or f"datasets/{self.release}", workers, resolution=resolution, test_views=test_views,
-            train_views=train_views, latitude_step_degrees=latitude_step_degrees,
-            longitude_step_degrees=longitude_step_degrees, depth=depth,
+            renderer, path, views or f"datasets/{self.release}", None, unseen, objects, split_seed, resolution,
+            test_views, train_views, latitude_step_degrees, longitude_step_degrees, depth, workers,
         )  # fmt: skip
+        self.seen, self.renderings = seen, None if renderings is None else Path(renderings)
 
-    @abstractmethod
     def file(self, name: str) -> Path:
         """The mesh of an object."""
+        return self.meshes / self.layout.format(name=name, category=name.rpartition("_")[0])
 
     @staticmethod
     @abstractmethod
@@ -75,37 +68,13 @@ class ScannedData(RenderedData):
         """An object's normalised scene, +Y up."""
 
     def available(self) -> list[str]:
-        """Names of the objects in the download; `UserError`, with the file looked for, where there are none."""
-        names = (file.parts[-3] for file in self.meshes.glob(self.meshes_of_release))
+        pattern = self.layout.format(name="*", category="*")
+        names = (file.parts[-3] for file in self.meshes.glob(pattern))
         sound = (name for name in names if self.file(name).is_file())
-        return names_below(self.meshes, sound, self.what, self.meshes / self.meshes_of_release)
+        return names_below(self.meshes, sound, self.what, self.meshes / pattern)
 
-    def objects(self) -> list[MeshObject]:
-        """The seen or unseen objects, sorted by name."""
-        how = {
-            "seen": self.seen,
-            "unseen": self.unseen,
-            "split_seed": self.split_seed,
-            "renderings": None if self.renderings is None else self.renderings.name,
-        }
-        names = kept_lists(self.path, how, self._choose).named(self.which)
-        return [MeshObject(name, "unlabelled", partial(self.load, self.file(name))) for name in names]
-
-    def _choose(self) -> ObjectLists:
-        available = self.available()
-        if self.renderings is None:
-            return drawn(available, self.seen, self.unseen, self.split_seed, self.meshes)
-        seen = object_names(self.renderings)
-        missing = sorted(set(seen) - set(available))
-        if missing:
-            raise UserError(
-                f"{self.meshes}: {len(missing)} of the {len(seen)} objects of {self.renderings} are missing, such as "
-                f"{self.file(missing[0])}"
-            )
-        if not self.unseen:
-            return ObjectLists(seen, [])
-        others = [name for name in available if name not in seen]
-        return ObjectLists(seen, drawn(others, 0, self.unseen, self.split_seed, self.meshes).unseen)
+    def object(self, name: str) -> MeshObject:
+        return MeshObject(name, "unlabelled", partial(self.load, self.file(name)))
 
 
 class _GSOFiles(FilePathResolver):
@@ -141,19 +110,13 @@ def load_gso(path: Path) -> trimesh.Scene:
 class GSOData(ScannedData):
     """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
 
-    release, what, meshes_of_release = "gso", "objects of GSO", "*/meshes/model.obj"
+    release, what, layout = "gso", "objects of GSO", "{name}/meshes/model.obj"
     load = staticmethod(load_gso)
-
-    def file(self, name: str) -> Path:
-        return self.meshes / name / "meshes" / "model.obj"
 
 
 @register("data", "oo3d")
 class OO3DData(ScannedData):
     """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
 
-    release, what, meshes_of_release = "oo3d", "scans of OmniObject3D", "*/*/Scan/Scan.obj"
+    release, what, layout = "oo3d", "scans of OmniObject3D", "{category}/{name}/Scan/Scan.obj"
     load = staticmethod(load_scene)  # has +Y up
-
-    def file(self, name: str) -> Path:
-        return self.meshes / name.rpartition("_")[0] / name / "Scan" / "Scan.obj"
