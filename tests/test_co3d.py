@@ -1,6 +1,7 @@
 import gzip
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,14 @@ def read_frames(root: Path) -> list:
         return json.loads(file.read())
 
 
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory) -> Path:
+    return write_category(tmp_path_factory.mktemp("drawn") / "co3d")
+
+
 @pytest.fixture
-def root(tmp_path) -> Path:
-    return write_category(tmp_path / "co3d")
+def root(drawn, tmp_path) -> Path:
+    return shutil.copytree(drawn, tmp_path / "co3d")
 
 
 @pytest.fixture
@@ -54,19 +60,20 @@ def make(root, tmp_path):
 # ---------------------------------------------------------------- the object's frame
 
 
-def seen_cameras(tmp_path, count: int = 24) -> tuple[torch.Tensor, torch.Tensor, list]:
+@pytest.fixture(scope="module")
+def seen_cameras(tmp_path_factory) -> tuple[torch.Tensor, torch.Tensor, list]:
     """Cameras in the world, intrinsics, and outlines of the box in photographs by them."""
-    cameras, intrinsics, pixels = [], [], []
-    for camera, matrix in orbit(count, seed=3):
-        Image.fromarray(photograph(camera, matrix, SIZE)[1]).save(tmp_path / "mask.png")
+    cameras, intrinsics, pixels, mask = [], [], [], tmp_path_factory.mktemp("seen") / "mask.png"
+    for camera, matrix in orbit(24, seed=3):
+        Image.fromarray(photograph(camera, matrix, SIZE)[1]).save(mask)
         cameras.append(in_world(camera))
         intrinsics.append(matrix)
-        pixels.append(mask_pixels(Photograph(Path("x"), tmp_path / "mask.png", camera, matrix, SIZE)))
+        pixels.append(mask_pixels(Photograph(Path("x"), mask, camera, matrix, SIZE)))
     return torch.stack(cameras), torch.stack(intrinsics), pixels
 
 
-def test_the_frame_is_found_from_cameras_and_silhouettes(tmp_path):
-    frame = frame_of_silhouettes(*seen_cameras(tmp_path))
+def test_the_frame_is_found_from_cameras_and_silhouettes(seen_cameras):
+    frame = frame_of_silhouettes(*seen_cameras)
     torch.testing.assert_close(frame.axes @ frame.axes.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
     assert frame.axes.det() == pytest.approx(1)
     up = WORLD[:, 1]
@@ -76,8 +83,8 @@ def test_the_frame_is_found_from_cameras_and_silhouettes(tmp_path):
     assert frame.sides.max() == 1 and frame.sides[0] == frame.sides[2]
 
 
-def test_the_frame_is_found_better_from_a_point_cloud_in_spite_of_stray_points(tmp_path):
-    cameras, intrinsics, pixels = seen_cameras(tmp_path)
+def test_the_frame_is_found_better_from_a_point_cloud_in_spite_of_stray_points(seen_cameras):
+    cameras, intrinsics, pixels = seen_cameras
     frame = frame_of_points(cameras, box_points())
     torch.testing.assert_close(frame.axes @ frame.axes.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
     assert frame.axes.det() == pytest.approx(1)
@@ -92,8 +99,8 @@ def test_the_frame_is_found_better_from_a_point_cloud_in_spite_of_stray_points(t
     assert frame.agrees(frame_of_silhouettes(cameras, intrinsics, pixels))
 
 
-def test_a_cloud_of_something_else_does_not_agree_with_the_silhouettes(tmp_path):
-    cameras, intrinsics, pixels = seen_cameras(tmp_path)
+def test_a_cloud_of_something_else_does_not_agree_with_the_silhouettes(seen_cameras):
+    cameras, intrinsics, pixels = seen_cameras
     silhouettes = frame_of_silhouettes(cameras, intrinsics, pixels)
     points = box_points()
     for others in (points + 0.5 * SCALE, (points - ORIGIN) * 2 + ORIGIN, (points - ORIGIN) / 2 + ORIGIN):
@@ -114,9 +121,10 @@ def test_cameras_on_a_vertical_arc_do_not_tell_up(tmp_path):
 
 
 @pytest.mark.parametrize(("cloud", "residual", "spread"), [(True, 0.15, 0.01), (False, 0.15, 0.03)])
-def test_views_keep_the_true_relative_poses_but_for_up_and_scale(tmp_path, cloud, residual, spread):
+def test_views_keep_the_true_relative_poses_but_for_up_and_scale(root, tmp_path, cloud, residual, spread):
     assert registry.get("data", "co3d") is CO3DData
-    root = write_category(tmp_path / "co3d", cloud=cloud)
+    if not cloud:
+        (root / CLOUD).unlink()
     data = CO3DData(str(root), str(tmp_path / "views"), scenes=1, train_views=8, test_views=3, resolution=64)
     data.prepare()
     assert data.names() == [f"hydrant-{SEQUENCE}"]
@@ -256,10 +264,10 @@ CLOUD = Path("hydrant", SEQUENCE, "pointcloud.ply")
         (lambda root: (root / CLOUD).write_bytes(b"ply"), r"pointcloud\.ply: does not load as a point cloud"),
         (lambda root: (root / CLOUD).write_bytes(b""), r"pointcloud\.ply: does not load as a point cloud"),
         (frame_with(mask=None), "frame 15 of sequence .* needs image, mask and viewpoint"),
-        (frame_with(viewpoint={"R": np.ones((3, 3)).tolist()}), "R is not a rotation"),
-        (frame_with(viewpoint={"T": [0, 0]}), "no camera of finite numbers"),
-        (frame_with(viewpoint={"focal_length": [0.0, 1.0]}), "focal_length must be positive"),
-        (frame_with(viewpoint={"intrinsics_format": "pixels"}), "intrinsics_format 'pixels' is none of"),
+        (frame_with(viewpoint={"R": np.ones((3, 3)).tolist()}), "the rotation of its camera is not a rotation"),
+        (frame_with(viewpoint={"T": [0, 0]}), "T of 3.*not 3 finite numbers"),
+        (frame_with(viewpoint={"focal_length": [0.0, 1.0]}), "its focal lengths must be positive"),
+        (frame_with(viewpoint={"intrinsics_format": "pixels"}), "intrinsics_format ndc_isotropic or .*'pixels'"),
         (
             lambda root: (root / "hydrant" / SEQUENCE / "images/frame000002.jpg").unlink(),
             "000002.jpg: there is no such",

@@ -52,13 +52,13 @@ def names_below(root: Path, names: Iterable[str], what: str, looked_for: object)
     return found
 
 
-def numbers(values: Any, *shape: int) -> Tensor | None:
-    """A tensor (float64) of nested lists or an array; None where they are not finite numbers of this shape."""
-    try:
-        tensor = torch.as_tensor(values, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        return None
-    return tensor if tensor.shape == shape and tensor.isfinite().all() else None
+def numbers(values: Any, *shape: int) -> Tensor:
+    """A tensor (float64) of nested lists or an array; to be called within `expecting`, as it raises what torch does
+    and `ValueError` where they are not finite numbers of this shape."""
+    tensor = torch.as_tensor(values, dtype=torch.float64)
+    if tensor.shape != shape or not tensor.isfinite().all():
+        raise ValueError(f"these are not {' x '.join(map(str, shape))} finite numbers")
+    return tensor
 
 
 def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:

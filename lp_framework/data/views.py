@@ -84,9 +84,8 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
     files, cameras = [], []
     for index, (file_path, matrix) in enumerate(frames):
         files.append(_image_file(path, file_path))
-        camera = numbers(matrix, 4, 4)
-        if camera is None:
-            raise UserError(f"{path}: transform_matrix of frame {index} is not a 4 x 4 matrix of finite numbers")
+        with expecting(f"{path}: transform_matrix of frame {index} is not a 4 x 4 matrix of finite numbers"):
+            camera = numbers(matrix, 4, 4)
         check_upright(camera, f"{path}: the camera of frame {index}")
         cameras.append(camera)
     return ObjectViews(name, split, ambiguity, unique_answer, files, torch.stack(cameras), field_of_view)

@@ -25,16 +25,16 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.reading import expecting, names_below, numbers, read_json
 from lp_framework.data.real_cameras import from_pytorch3d, ndc_intrinsics
-from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
+from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData, checked
 from lp_framework.data.sets.object_frame import frame_of_points, frame_of_silhouettes
 from lp_framework.data.sets.object_lists import drawn, kept_lists
 from lp_framework.errors import UserError
-from lp_framework.geometry import is_rotation
 from lp_framework.registry import register
 
 FORMATS = {"ndc_isotropic": True, "ndc_norm_image_bounds": False}
@@ -128,26 +128,16 @@ def _of_sequence(file: Path, sequence: str) -> list[dict[str, Any]]:
 def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
     """A frame as annotated, its camera still in the world of its sequence."""
     where = f"{file}: frame {frame['frame_number']} of sequence '{frame['sequence_name']}'"
-    with expecting(f"{where} needs image, mask and viewpoint with R, T, focal_length and principal_point"):
+    wanted = "R of 3 x 3 numbers, T of 3, focal_length and principal_point of 2"
+    with expecting(f"{where} needs image, mask and viewpoint with {wanted}, intrinsics_format {' or '.join(FORMATS)}"):
         view, (height, width) = frame["viewpoint"], frame["image"]["size"]
+        size = (int(width), int(height))
         rotation, translation = numbers(view["R"], 3, 3), numbers(view["T"], 3)
         focal, principal = numbers(view["focal_length"], 2), numbers(view["principal_point"], 2)
+        isotropic = FORMATS[view.get("intrinsics_format", "ndc_norm_image_bounds")]
         image, mask = root / frame["image"]["path"], root / frame["mask"]["path"]
-        size = (int(width), int(height))
-        form = str(view.get("intrinsics_format", "ndc_norm_image_bounds"))
-    if rotation is None or translation is None or focal is None or principal is None:
-        raise UserError(f"{where} has no camera of finite numbers: R 3 x 3, T 3, focal_length 2, principal_point 2")
-    if not is_rotation(rotation):
-        raise UserError(f"{where}: R is not a rotation")
-    if not (focal > 0).all():
-        raise UserError(f"{where}: focal_length must be positive, got {focal.tolist()}")
-    if form not in FORMATS:
-        raise UserError(f"{where}: intrinsics_format {form!r} is none of {', '.join(FORMATS)}")
-    for found in (image, mask):
-        if not os.path.isfile(found):  # unlike Path.is_file, False for an impossible name
-            raise UserError(f"{found}: there is no such file")
-    camera, intrinsics = from_pytorch3d(rotation, translation), ndc_intrinsics(focal, principal, size, FORMATS[form])
-    return Photograph(image, mask, camera, intrinsics, size)
+    camera, intrinsics = from_pytorch3d(rotation, translation), ndc_intrinsics(focal, principal, size, isotropic)
+    return checked(Photograph(image, mask, camera, intrinsics, size), where)
 
 
 def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | None, dict[str, float | None]]:
@@ -159,12 +149,12 @@ def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | Non
     wanted = "needs point_cloud with path and quality_score, or null, and viewpoint_quality_score"
     with expecting(f"{file}: sequence '{sequence}' {wanted}"):
         cloud = found[0].get("point_cloud") or {}
-        path = root / cloud["path"] if cloud else None
+        path = root / cloud["path"] if cloud and os.path.isfile(root / cloud["path"]) else None
         scores = {
             "viewpoint_quality_score": _score(found[0].get("viewpoint_quality_score")),
             "point_cloud_quality_score": _score(cloud.get("quality_score")),
         }
-    return path if path is not None and os.path.isfile(path) else None, scores
+    return path, scores
 
 
 def _score(value: Any) -> float | None:
@@ -213,10 +203,7 @@ def read_points(file: Path) -> Tensor:
 def mask_pixels(photograph: Photograph) -> NDArray[np.float64]:
     """Centres `[M, 2]` (x, y; pixels) of the outermost object pixels in each row and column of a photograph's mask."""
     inside = np.asarray(photograph.read(photograph.mask, "L")) >= HALF
-    outline = inside & ~(
-        np.pad(inside, 1)[1:-1, :-2] & np.pad(inside, 1)[1:-1, 2:]
-        & np.pad(inside, 1)[:-2, 1:-1] & np.pad(inside, 1)[2:, 1:-1]
-    )  # fmt: skip
+    outline = inside & ~binary_erosion(inside)
     rows, columns = np.nonzero(outline)
     chosen = np.linspace(0, len(rows) - 1, min(len(rows), SAMPLES)).round().astype(int)
     return np.stack([columns[chosen], rows[chosen]], axis=-1) + 0.5

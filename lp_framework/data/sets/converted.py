@@ -15,7 +15,7 @@ import math
 import warnings
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +47,7 @@ from lp_framework.data.real_cameras import (
 from lp_framework.data.sets.object_lists import LIST
 from lp_framework.data.source import ViewSource
 from lp_framework.errors import UserError, check_settings
-from lp_framework.geometry import to_ifusion, view_pose
+from lp_framework.geometry import is_rotation, to_ifusion, view_pose
 from lp_framework.keyed_random import stable_id
 
 RECORD = "conversion.json"
@@ -75,6 +75,16 @@ class Photograph:
         return image
 
 
+def checked(photograph: Photograph, where: str) -> Photograph:
+    """The photograph; `UserError`, which begins with `where` its annotation is, for a camera that can be none."""
+    camera, intrinsics = photograph.camera, photograph.intrinsics
+    if not is_rotation(camera[:3, :3]):
+        raise UserError(f"{where}: the rotation of its camera is not a rotation")
+    if not (intrinsics.diagonal()[:2] > 0).all():
+        raise UserError(f"{where}: its focal lengths must be positive")
+    return photograph
+
+
 class Annotated(NamedTuple):
     """What a data set says of an object: photographs, `points` `[P, 3]` on its bounding box, how many photographs were
     left out for which reason, and what else `conversion.json` is to keep."""
@@ -94,8 +104,8 @@ class ConvertedSource(ViewSource):
     download: Path
 
     @abstractmethod
-    def convert(self, name: str) -> None:
-        """Write the views of an object by `write`."""
+    def convert(self, name: str, folder: Path) -> dict[str, Any]:
+        """Write an object's views into a folder; what its record is to keep beside `demands`."""
 
     def demands(self) -> dict[str, Any]:
         """What of the settings decides an object's views, as plain values."""
@@ -112,22 +122,34 @@ class ConvertedSource(ViewSource):
             missing = [name for name in objects if not is_converted(self.path / name, self.demands())]
             for name in tracked(missing, "converting photographs"):
                 try:
-                    self.convert(name)
+                    self._write(name)
                 except UserError as error:
                     failures[name] = str(error)
         listed = self.path / LIST
         how = f"; mend them, or take their names out of {listed}" if listed.is_file() else ""
         raise_failures(failures, len(objects), f"converted{how}")
 
-    def write(self, name: str, record: Mapping[str, Any], write: Callable[[Path], None]) -> None:
-        """Have an object's views written, with their record, whole or not at all; `UserError` where some are there."""
+    def _write(self, name: str) -> None:
         folder = self.path / name
         if folder.exists():
             raise UserError(
                 f"{folder}: holds other views than these settings make (see its {RECORD}); choose another data.views "
                 "or delete it"
             )
-        write_object(folder, RECORD, {"object": name, **self.demands(), **record}, write)
+        record = {"object": name, **self.demands()}
+        write_object(folder, RECORD, record, lambda partial: record.update(self.convert(name, partial)))
+
+
+def is_converted(folder: Path, demands: Mapping[str, Any]) -> bool:
+    """Whether a folder holds an object's views that were made as its record, and `demands`, say."""
+    record = read_record(folder / RECORD)
+    return bool(record) and not differences(record, demands)
+
+
+def frame(file: str, camera: Tensor) -> dict[str, Any]:
+    """What a `transform.json` says of a view: its file and its camera `[4, 4]`."""
+    latlon = to_ifusion(view_pose(camera)).tolist()
+    return {"file_path": file, "transform_matrix": camera.tolist(), "latlon": latlon}
 
 
 class PhotographedData(ConvertedSource):
@@ -158,7 +180,7 @@ class PhotographedData(ConvertedSource):
         names = ("train_views", "test_views", "resolution", "split_seed")
         return {**super().demands(), **{name: getattr(self, name) for name in names}}
 
-    def convert(self, name: str) -> None:
+    def convert(self, name: str, folder: Path) -> dict[str, Any]:
         photographs, points, left_out, remarks = self.photographs(name)
         views, more = sound_views(photographs, points)
         left_out += more
@@ -176,44 +198,45 @@ class PhotographedData(ConvertedSource):
         directions = torch.nn.functional.normalize(places, dim=-1).numpy()
         random = np.random.default_rng([self.split_seed, stable_id(name)])
         chosen = spread(directions, wanted, random)
-        test = set(random.choice(chosen, self.test_views, replace=False).tolist())
-        splits = {
-            "train": [views[index] for index in sorted(chosen) if index not in test],
-            "test": [views[index] for index in sorted(test)],
-        }
-        residuals = [view.residual for split in splits.values() for view in split]
-        record = {
+        test = np.sort(random.choice(chosen, self.test_views, replace=False))
+        for split, indices in {"train": np.setdiff1d(chosen, test), "test": test}.items():
+            (folder / split / "rgb").mkdir(parents=True)
+            frames = []
+            for number, index in enumerate(indices):
+                file = f"{number:03d}.png"
+                crop(views[index], self.resolution).save(folder / split / "rgb" / file, compress_level=1)
+                frames.append(self._frame(file, views[index]))
+            write_transforms(folder / split, frames)
+        taken = [views[index] for index in chosen]
+        return {
             **remarks,
             "left_out": dict(left_out),
-            "median_perspective_residual": float(np.median(residuals)),
-            "largest_perspective_residual": max(residuals),
-            "largest_turn_degrees": max(view.turn for split in splits.values() for view in split),
+            "median_perspective_residual": float(np.median([view.residual for view in taken])),
+            "largest_perspective_residual": max(view.residual for view in taken),
+            "largest_turn_degrees": max(view.turn for view in taken),
         }
 
-        def write(folder: Path) -> None:
-            for split, chosen_views in splits.items():
-                (folder / split / "rgb").mkdir(parents=True)
-                frames = []
-                for index, view in enumerate(chosen_views):
-                    file = f"{index:03d}.png"
-                    crop(view, self.resolution).save(folder / split / "rgb" / file, compress_level=1)
-                    frames.append({"file_path": file, **view.frame(self.download)})
-                write_transforms(folder / split, frames)
-
-        self.write(name, record, write)
-
-
-def is_converted(folder: Path, demands: Mapping[str, Any]) -> bool:
-    """Whether a folder holds an object's views that were made as its record, and `demands`, say."""
-    record = read_record(folder / RECORD)
-    return bool(record) and not differences(record, demands)
+    def _frame(self, file: str, view: SphericalView) -> dict[str, Any]:
+        photograph, radius = view.photograph, view.radius
+        source = photograph.file
+        angle = crop_field_of_view(photograph.camera[:3, 3].norm(), radius)
+        return {
+            **frame(file, spherical_camera(photograph.camera, radius)),
+            "source": str(source.relative_to(self.download) if source.is_relative_to(self.download) else source),
+            "width": photograph.size[0],
+            "height": photograph.size[1],
+            "photograph_camera": photograph.camera.tolist(),
+            "photograph_intrinsics": photograph.intrinsics.tolist(),
+            "turn_degrees": view.turn,
+            "crop_angle_degrees": math.degrees(angle.item()),
+            "perspective_residual": view.residual,
+        }
 
 
 # ---------------------------------------------------------------- choosing
 
 
-@dataclass(frozen=True)
-class SphericalView:
+class SphericalView(NamedTuple):
     """A photograph with the effective radius of its crop (units of the object's longest side), the angle of its virtual
     turn (degrees) and its perspective residual (units of the image's side)."""
 
@@ -221,25 +244,6 @@ class SphericalView:
     radius: Tensor
     turn: float
     residual: float
-
-    def frame(self, source: Path) -> dict[str, Any]:
-        """What `transform.json` says of it, but for the file."""
-        photograph = self.photograph
-        camera = spherical_camera(photograph.camera, self.radius)
-        angle = crop_field_of_view(photograph.camera[:3, 3].norm(), self.radius)
-        file = photograph.file
-        return {
-            "transform_matrix": camera.tolist(),
-            "latlon": to_ifusion(view_pose(camera)).tolist(),
-            "source": str(file.relative_to(source) if file.is_relative_to(source) else file),
-            "width": photograph.size[0],
-            "height": photograph.size[1],
-            "photograph_camera": photograph.camera.tolist(),
-            "photograph_intrinsics": photograph.intrinsics.tolist(),
-            "turn_degrees": self.turn,
-            "crop_angle_degrees": math.degrees(angle.item()),
-            "perspective_residual": self.residual,
-        }
 
 
 def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list[SphericalView], Counter[str]]:

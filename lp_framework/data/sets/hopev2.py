@@ -21,30 +21,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from lp_framework.data.photographs import opened
 from lp_framework.data.reading import expecting, numbers, read_json
-from lp_framework.data.real_cameras import normalised, z_up_to_y_up
-from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
+from lp_framework.data.real_cameras import z_up_to_y_up
+from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData, checked
+from lp_framework.data.sets.object_frame import ObjectFrame
 from lp_framework.data.sets.object_lists import ObjectLists, kept_lists
 from lp_framework.errors import UserError
-from lp_framework.geometry import from_opencv, inverse, is_rotation, rigid_transform
+from lp_framework.geometry import from_opencv, inverse, rigid_transform
 from lp_framework.registry import register
 
 ANNOTATIONS = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
-
-
-class Box(NamedTuple):
-    """An object's bounding box in its model's frame (+Z up): centre and side lengths `[3]`, millimetres."""
-
-    centre: Tensor
-    sides: Tensor
-
-    def corners(self) -> Tensor:
-        """Its corners `[8, 3]` in the object's frame: centre at the origin, +Y up, longest side 1."""
-        halves = (self.sides / self.sides.max() / 2)[[1, 2, 0]]
-        return torch.cartesian_prod(*(torch.stack([-half, half]) for half in halves))
 
 
 class Instance(NamedTuple):
@@ -86,50 +74,26 @@ class HOPEv2Data(PhotographedData):
 
     def names(self) -> list[str]:
         """The objects that have a model, `obj_000001` and so on."""
-        return kept_lists(self.path, {}, lambda: ObjectLists([f"obj_{n:06d}" for n in sorted(self._boxes())], [])).seen
+        return kept_lists(self.path, {}, lambda: ObjectLists([f"obj_{n:06d}" for n in sorted(self._frames())], [])).seen
 
     def photographs(self, name: str) -> Annotated:
         number = int(name.removeprefix("obj_"))
-        box = self._boxes()[number]
+        frame = self._frames()[number]
         instances = self._instances.get(number, [])
         visible = [each for each in instances if each.visible >= self.least_visible]
         hidden = Counter({"occluded": len(instances) - len(visible)})
-        return Annotated([self._photograph(each, box) for each in visible], box.corners(), +hidden, {})
+        return Annotated([_photograph(each, frame) for each in visible], frame.corners(), +hidden, {})
 
-    def _photograph(self, instance: Instance, box: Box) -> Photograph:
-        scene, image = instance.scene, instance.image
-        poses, cameras = scene / "scene_gt.json", scene / "scene_camera.json"
-        rotation = _numbers(instance.pose, "cam_R_m2c", 9, poses, image).view(3, 3)
-        translation = _numbers(instance.pose, "cam_t_m2c", 3, poses, image)
-        if not is_rotation(rotation):
-            raise UserError(f"{poses}: cam_R_m2c of image {image} is not a rotation")
-        if not (rotation @ box.centre + translation)[2] > 0:
-            raise UserError(f"{poses}: image {image} has an object behind its camera (cam_t_m2c)")
-        intrinsics = _numbers(instance.camera, "cam_K", 9, cameras, image).view(3, 3)
-        if not (intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
-            raise UserError(f"{cameras}: cam_K of image {image} has no positive focal lengths")
-        half = intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        files = [scene / "rgb" / f"{image:06d}{suffix}" for suffix in (".png", ".jpg")]
-        file = next((file for file in files if file.is_file()), None)
-        if file is None:
-            raise UserError(f"{files[0]}: there is no such image, nor one that ends in .jpg")
-        mask = scene / "mask_visib" / f"{image:06d}_{instance.place:06d}.png"
-        if not mask.is_file():
-            raise UserError(f"{mask}: there is no such mask")
-        camera = from_opencv(inverse(rigid_transform(rotation, translation)))
-        camera = z_up_to_y_up(normalised(camera, box.centre, box.sides.max()))
-        with opened(file) as photograph:
-            return Photograph(file, mask, camera, intrinsics + half, photograph.size)
-
-    def _boxes(self) -> dict[int, Box]:
+    def _frames(self) -> dict[int, ObjectFrame]:
+        """The objects' frames in those of their models, by number; millimetres."""
         file = self.download / "models" / "models_info.json"
         if not self.download.is_dir():
             raise UserError(f"{self.download}: there is no such folder; give data.path=FOLDER of a BOP data set")
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
-            boxes = {int(number): _box(info) for number, info in read_json(file).items()}
-        if not boxes or not all(box.sides.max() > 0 for box in boxes.values()):
+            frames = {int(number): _frame(info) for number, info in read_json(file).items()}
+        if not frames or not all(frame.longest_side > 0 for frame in frames.values()):
             raise UserError(f"{file}: has no objects with an extent")
-        return boxes
+        return frames
 
     @cached_property
     def _instances(self) -> dict[int, list[Instance]]:
@@ -152,15 +116,25 @@ class HOPEv2Data(PhotographedData):
         return found
 
 
-def _box(info: dict[str, Any]) -> Box:
-    low, sides = (
-        torch.tensor([info[f"{key}_{axis}"] for axis in "xyz"], dtype=torch.float64) for key in ("min", "size")
-    )
-    return Box(low + sides / 2, sides)
+def _frame(info: dict[str, Any]) -> ObjectFrame:
+    low, sides = (numbers([info[f"{key}_{axis}"] for axis in "xyz"], 3) for key in ("min", "size"))
+    axes, longest = z_up_to_y_up(torch.eye(4, dtype=torch.float64))[:3, :3], sides.max()
+    return ObjectFrame(axes, low + sides / 2, longest, axes @ sides / longest)
 
 
-def _numbers(entry: Any, key: str, count: int, file: Path, image: int) -> Tensor:
-    values = numbers(entry[key], count) if isinstance(entry, dict) and key in entry else None
-    if values is None:
-        raise UserError(f"{file}: {key} of image {image} must be {count} finite numbers")
-    return values
+def _photograph(instance: Instance, frame: ObjectFrame) -> Photograph:
+    scene, image = instance.scene, instance.image
+    where = f"{scene}: image {image}"
+    with expecting(f"{where} needs cam_K of 9 numbers, cam_R_m2c of 9 and cam_t_m2c of 3"):
+        rotation, translation = (numbers(instance.pose[f"cam_{key}_m2c"], count) for key, count in (("R", 9), ("t", 3)))
+        intrinsics = numbers(instance.camera["cam_K"], 9).view(3, 3)
+    pose = rigid_transform(rotation.view(3, 3), translation)
+    if (pose[:3, :3] @ frame.centre + pose[:3, 3])[2] <= 0:
+        raise UserError(f"{where} has an object behind its camera (cam_t_m2c)")
+    camera = frame.camera(from_opencv(inverse(pose)))
+    half = intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    files = [scene / "rgb" / f"{image:06d}{suffix}" for suffix in (".png", ".jpg")]
+    file = next((file for file in files if file.is_file()), files[0])
+    mask = scene / "mask_visib" / f"{image:06d}_{instance.place:06d}.png"
+    with opened(file) as photograph:
+        return checked(Photograph(file, mask, camera, intrinsics + half, photograph.size), where)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,10 +22,10 @@ from lp_framework.data.object_folders import write_transforms
 from lp_framework.data.photographs import read_image
 from lp_framework.data.reading import check_upright, names_below
 from lp_framework.data.real_cameras import z_up_to_y_up
-from lp_framework.data.sets.converted import ConvertedSource
+from lp_framework.data.sets.converted import ConvertedSource, frame
 from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
-from lp_framework.geometry import rigid_transform, to_ifusion, view_pose
+from lp_framework.geometry import rigid_transform
 from lp_framework.registry import register
 
 RADIUS = 1.85
@@ -50,25 +51,20 @@ class Omni3DData(ConvertedSource):
             )
         return super().views(name, split)
 
-    def convert(self, name: str) -> None:
-        cameras = omni3d_cameras(self.download, name)
-
-        def write(folder: Path) -> None:
-            (folder / "test" / "rgb").mkdir(parents=True)
-            frames = []
-            for view, camera in cameras.items():
-                file = self.download / name / "images" / f"{view}.png"
-                image = read_image(file)
-                if image.mode != "RGBA":
-                    raise UserError(f"{file}: has no transparent background (alpha channel)")
-                if image.width != image.height:
-                    raise UserError(f"{file}: is {image.width} x {image.height} pixels; views must be square")
-                shutil.copyfile(file, folder / "test" / "rgb" / f"{view}.png")
-                latlon = to_ifusion(view_pose(camera)).tolist()
-                frames.append({"file_path": f"{view}.png", "transform_matrix": camera.tolist(), "latlon": latlon})
-            write_transforms(folder / "test", frames)
-
-        self.write(name, {}, write)
+    def convert(self, name: str, folder: Path) -> dict[str, Any]:
+        (folder / "test" / "rgb").mkdir(parents=True)
+        frames = []
+        for view, camera in omni3d_cameras(self.download, name).items():
+            file = self.download / name / "images" / f"{view}.png"
+            image = read_image(file)
+            if image.mode != "RGBA":
+                raise UserError(f"{file}: has no transparent background (alpha channel)")
+            if image.width != image.height:
+                raise UserError(f"{file}: is {image.width} x {image.height} pixels; views must be square")
+            shutil.copyfile(file, folder / "test" / "rgb" / file.name)
+            frames.append(frame(file.name, camera))
+        write_transforms(folder / "test", frames)
+        return {}
 
 
 def omni3d_objects(root: str | Path) -> list[str]:
