@@ -11,13 +11,13 @@ from lp_framework.data.real_cameras import (
     effective_radii,
     from_pytorch3d,
     ndc_intrinsics,
-    normalised,
     perspective_residual,
     project,
     spherical_camera,
     turn_towards_centre,
     z_up_to_y_up,
 )
+from lp_framework.data.sets.object_frame import ObjectFrame
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.geometry import (
     camera_to_world,
@@ -97,7 +97,8 @@ def test_normalising_the_frame_changes_no_image():
     camera, intrinsics = real_camera(5)
     centre, side = torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64), 37.0
     placed = rigid_transform(camera[:3, :3], camera[:3, 3] * side + centre)
-    torch.testing.assert_close(normalised(placed, centre, side), camera, rtol=0, atol=1e-12)
+    frame = ObjectFrame(torch.eye(3, dtype=torch.float64), centre, torch.tensor(side), torch.ones(3))
+    torch.testing.assert_close(frame.camera(placed), camera, rtol=0, atol=1e-12)
     pixels = project(placed, intrinsics, BOX * side + centre)
     torch.testing.assert_close(pixels, project(camera, intrinsics, BOX), rtol=1e-9, atol=1e-7)
 

@@ -39,7 +39,8 @@ def expecting(sentence: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:  # parsers raise anything from KeyError to struct.error
-        raise UserError(f"{sentence} ({type(error).__name__}: {error})") from error
+        reason = " ".join(str(error).split())
+        raise UserError(f"{sentence} ({type(error).__name__}: {reason})") from error
 
 
 def names_below(root: Path, names: Iterable[str], what: str, looked_for: object) -> list[str]:

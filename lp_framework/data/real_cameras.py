@@ -74,11 +74,6 @@ def z_up_to_y_up(camera: Tensor) -> Tensor:
     return camera[..., [1, 2, 0, 3], :]
 
 
-def normalised(camera: Tensor, centre: Tensor, longest_side: Tensor | float) -> Tensor:
-    """A camera `[..., 4, 4]` in the frame whose origin is `centre` `[3]` and whose unit is `longest_side`."""
-    return rigid_transform(camera[..., :3, :3], (camera[..., :3, 3] - centre) / longest_side)
-
-
 # ---------------------------------------------------------------- to spherical ones
 
 

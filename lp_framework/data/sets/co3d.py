@@ -75,25 +75,25 @@ class CO3DData(PhotographedData):
         ).seen
 
     def _available(self) -> list[str]:
-        files = (file for folder in sorted(self.download.glob("*")) for file in self._set_lists(folder))
-        scenes = (f"{file.parents[1].name}-{sequence}" for file in files for sequence, _ in _frames_of_set_list(file))
+        folders = sorted(self.download.glob("*"))
+        scenes = (f"{folder.name}-{sequence}" for folder in folders for sequence, _ in self._listed(folder))
         looked_for = (f"{self.download}/*/set_lists/set_lists_{subset}.json" for subset in self.subsets)
         return names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
 
-    def _set_lists(self, folder: Path) -> list[Path]:
-        """Those that a category has; not every one is in every subset."""
-        files = [folder / "set_lists" / f"set_lists_{subset}.json" for subset in self.subsets]
-        return [file for file in files if file.is_file()]
+    def _listed(self, folder: Path) -> set[tuple[str, int]]:
+        """Sequence and frame number of every frame in the set lists that a category has; few have all."""
+        listed: set[tuple[str, int]] = set()
+        for file in (folder / "set_lists" / f"set_lists_{subset}.json" for subset in self.subsets):
+            if file.is_file():
+                content = read_json(file)
+                with expecting(f"{file}: is no set list of CO3Dv2"):
+                    listed |= {(str(name), int(number)) for frames in content.values() for name, number, _ in frames}
+        return listed
 
     def photographs(self, name: str) -> Annotated:
         category, _, sequence = name.partition("-")
         folder = self.download / category
-        listed = {
-            number
-            for file in self._set_lists(folder)
-            for found, number in _frames_of_set_list(file)
-            if found == sequence
-        }
+        listed = {number for found, number in self._listed(folder) if found == sequence}
         file = folder / "frame_annotations.jgz"
         annotated = _of_sequence(file, sequence)
         frames = {each["frame_number"]: each for each in annotated if isinstance(each.get("frame_number"), int)}
@@ -110,19 +110,11 @@ class CO3DData(PhotographedData):
 # ---------------------------------------------------------------- annotations
 
 
-def _frames_of_set_list(file: Path) -> list[tuple[str, int]]:
-    """Sequence and frame number of every frame in a set list, whatever part it is in."""
-    content = read_json(file)
-    with expecting(f"{file}: is no set list of CO3Dv2"):
-        return [(str(sequence), int(number)) for frames in content.values() for sequence, number, _ in frames]
-
-
 def _of_sequence(file: Path, sequence: str) -> list[dict[str, Any]]:
     """The entries of a file of annotations that are of a sequence."""
     content = read_json(file)
-    if not isinstance(content, list):
-        raise UserError(f"{file}: must hold a list of frames or sequences")
-    return [each for each in content if isinstance(each, dict) and each.get("sequence_name") == sequence]
+    with expecting(f"{file}: must hold a list of frames or sequences, each with sequence_name"):
+        return [each for each in content if each["sequence_name"] == sequence]
 
 
 def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
@@ -192,12 +184,12 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
 
 def read_points(file: Path) -> Tensor:
     """The points `[P, 3]` (float64) of a PLY file; `UserError` naming it where it does not load or has fewer than 3."""
-    with expecting(f"{file}: does not load as a point cloud"):
+    with expecting(f"{file}: does not load as a point cloud of three or more points"):
         loaded: Any = trimesh.load(file, process=False)
-        points = np.asarray(loaded.vertices, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
-        raise UserError(f"{file}: a point cloud has three or more points of finite numbers, got {list(points.shape)}")
-    return torch.from_numpy(points)
+        points = numbers(np.asarray(loaded.vertices), len(loaded.vertices), 3)
+        if len(points) < 3:
+            raise ValueError(f"it has {len(points)}")
+    return points
 
 
 def mask_pixels(photograph: Photograph) -> NDArray[np.float64]:

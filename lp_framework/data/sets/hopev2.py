@@ -126,12 +126,12 @@ def _photograph(instance: Instance, frame: ObjectFrame) -> Photograph:
     scene, image = instance.scene, instance.image
     where = f"{scene}: image {image}"
     with expecting(f"{where} needs cam_K of 9 numbers, cam_R_m2c of 9 and cam_t_m2c of 3"):
-        rotation, translation = (numbers(instance.pose[f"cam_{key}_m2c"], count) for key, count in (("R", 9), ("t", 3)))
+        rotation, translation = instance.pose["cam_R_m2c"], instance.pose["cam_t_m2c"]
+        pose = rigid_transform(numbers(rotation, 9).view(3, 3), numbers(translation, 3))
         intrinsics = numbers(instance.camera["cam_K"], 9).view(3, 3)
-    pose = rigid_transform(rotation.view(3, 3), translation)
+    camera = frame.camera(from_opencv(inverse(pose)))
     if (pose[:3, :3] @ frame.centre + pose[:3, 3])[2] <= 0:
         raise UserError(f"{where} has an object behind its camera (cam_t_m2c)")
-    camera = frame.camera(from_opencv(inverse(pose)))
     half = intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     files = [scene / "rgb" / f"{image:06d}{suffix}" for suffix in (".png", ".jpg")]
     file = next((file for file in files if file.is_file()), files[0])

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lp_framework.data.object_folders import write_transforms
 from lp_framework.data.photographs import read_image
-from lp_framework.data.reading import check_upright, names_below
+from lp_framework.data.reading import check_upright, expecting, names_below, numbers
 from lp_framework.data.real_cameras import z_up_to_y_up
 from lp_framework.data.sets.converted import ConvertedSource, frame
 from lp_framework.data.views import ObjectViews
@@ -91,13 +91,9 @@ def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
 
 
 def _camera(file: Path) -> Tensor:
-    try:
+    with expecting(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers"):
         matrix = np.load(file).astype(np.float64, casting="same_kind")
-    except Exception as error:  # damaged files raise anything from EOFError to SyntaxError
-        raise UserError(f"{file}: is not a readable array ({' '.join(str(error).split())})") from error
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise UserError(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers, got {list(matrix.shape)}")
-    rows = torch.from_numpy(matrix)
-    camera = z_up_to_y_up(rigid_transform(rows[:3, :3], rows[:3, 3]))
+        rows = numbers(matrix[:3], 3, 4)
+    camera = z_up_to_y_up(rigid_transform(rows[:, :3], rows[:, 3]))
     check_upright(camera, f"{file}: its camera", up="+Z")
     return camera
