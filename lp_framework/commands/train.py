@@ -41,8 +41,9 @@ from lp_framework.commands.finished import with_overrides
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
-from lp_framework.models.checkpoints import BEST, FOLDER, LAST, RECIPE, KeepRecipe, read_checkpoint
+from lp_framework.models.checkpoints import BEST, FOLDER, LAST, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
+from lp_framework.models.trained_module import RECIPE
 from lp_framework.report.page import write_run_page
 from lp_framework.viz.training import save_training_picture
 
@@ -81,9 +82,10 @@ def run(config: DictConfig) -> None:
     seed_run(config.seed)
     components = Components(plain(config))
     data, model = components["data"], components["model"]
+    model.recipe = recipe
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
-    trainer = build_trainer(plain(config.trainer), folder, callbacks(config, folder, recipe), loggers(config, folder))
+    trainer = build_trainer(plain(config.trainer), folder, callbacks(config, folder), loggers(config, folder))
     if trainer.is_global_zero:
         write_text(folder / "config.yaml", OmegaConf.to_yaml(config))
         if checkpoint is not None:
@@ -161,10 +163,10 @@ def is_finished(folder: Path, config: DictConfig, checkpoint: Mapping[str, Any])
     return epochs is not None and 0 <= epochs <= checkpoint["epoch"] + 1 and (folder / TRAINING).is_file()
 
 
-def callbacks(config: DictConfig, folder: Path, recipe: dict[str, Any]) -> list[Callback]:
+def callbacks(config: DictConfig, folder: Path) -> list[Callback]:
     """Lightning's own parts: checkpoints (best, last), early stopping, moving average, rates, progress."""
     validated = config.data.validation_views > 0
-    chosen: list[Callback] = [KeepRecipe(**recipe), LearningRateMonitor("step"), RichProgressBar(leave=False)]
+    chosen: list[Callback] = [LearningRateMonitor("step"), RichProgressBar(leave=False)]
     if config.ema is not None:
         chosen.append(EMAWeightAveraging(decay=config.ema))
     if validated and config.patience is not None:

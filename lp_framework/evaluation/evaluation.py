@@ -12,7 +12,7 @@ from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch, ViewTable
 from lp_framework.errors import UserError
 from lp_framework.evaluation.journal import Journal
-from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch, without_success_rates
+from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch
 from lp_framework.geometry import (
     apply_relative_pose,
     at_optimal_scale,
@@ -79,7 +79,7 @@ class Evaluation(LightningModule):
     def gather_for(self, table: ViewTable) -> None:
         """Start with no results, for pairs of the views in `table`."""
         self.table = table
-        self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer)
+        self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer, self.solver.one_answer)
 
     def solve(self, batch: PairBatch) -> Solution:
         """The solver's solution of a batch's pairs, or of its sets as one of those pairs."""
@@ -117,9 +117,9 @@ class Evaluation(LightningModule):
             self.journal.append(solved, self.global_rank)
 
     def result(self) -> dict[str, Any]:
-        """See `PoseMetrics.compute`; of a solver with one answer a pair without success rates."""
+        """See `PoseMetrics.compute`."""
         metrics: dict[str, Any] = self.metrics.compute()
-        return without_success_rates(metrics) if self.solver.one_answer else metrics
+        return metrics
 
 
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:

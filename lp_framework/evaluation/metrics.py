@@ -55,19 +55,6 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
     return metrics
 
 
-def without_success_rates(metrics: dict[str, Any]) -> dict[str, Any]:
-    """The metrics, at any depth, without the shares of starts, of which a solver with one answer a pair has none.
-
-    >>> without_success_rates({"metrics": {"R@5": 0.5, "SR@5": 0.5}, "pairs": 2})
-    {'metrics': {'R@5': 0.5}, 'pairs': 2}
-    """
-    return {
-        name: without_success_rates(value) if isinstance(value, dict) else value
-        for name, value in metrics.items()
-        if not name.startswith(("SR@", "SR(R)@"))
-    }
-
-
 def median(values: Tensor) -> float:
     """The median, of an even count the mean of the middle two; infinity is a value like others.
 
@@ -86,16 +73,22 @@ class PoseMetrics(HostMetric):
     per ambiguity class.
 
     `names`, `ambiguities` and `unique_answer` describe the objects by index; `unique_answer` is None where unknown.
+    A solver with `one_answer` a pair has no success rates over starts.
     """
 
     batch: list[Tensor]  # the first pair of each
     cost: list[Tensor]  # pairs, seconds, passes of each batch
 
     def __init__(
-        self, names: Sequence[str], ambiguities: Sequence[str], unique_answer: Sequence[bool | None], **arguments: Any
+        self,
+        names: Sequence[str],
+        ambiguities: Sequence[str],
+        unique_answer: Sequence[bool | None],
+        one_answer: bool = False,
     ) -> None:
-        super().__init__(**arguments)
+        super().__init__()
         self.names, self.ambiguities, self.unique_answer = list(names), list(ambiguities), list(unique_answer)
+        self.one_answer = one_answer
         for state in (*STATES, "batch", "cost"):
             self.add_state(state, [], dist_reduce_fx="cat")
         self._rows: dict[str, Tensor] = {}
@@ -126,7 +119,8 @@ class PoseMetrics(HostMetric):
         def over(chosen: Tensor) -> dict[str, float] | None:
             if not len(chosen):
                 return None
-            return summarise(rows["rotation"][chosen], rows["translation"][chosen], rows["chosen"][chosen])
+            summary = summarise(rows["rotation"][chosen], rows["translation"][chosen], rows["chosen"][chosen])
+            return {key: value for key, value in summary.items() if not (self.one_answer and key.startswith("SR"))}
 
         def rows_of(objects: list[bool]) -> Tensor:
             return torch.tensor(objects)[rows["object"]].nonzero().flatten()

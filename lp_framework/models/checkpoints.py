@@ -12,20 +12,18 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
 import torch
-from lightning import Callback, LightningModule, Trainer
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lp_framework import registry
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.models.pose_model import PoseModel
-from lp_framework.models.trained_module import TrainedModule
+from lp_framework.models.trained_module import RECIPE, TrainedModule
 
 FOLDER = "checkpoints"
 LATEST = "latest"
@@ -33,21 +31,9 @@ LAST, BEST = "last.ckpt", "best.ckpt"
 SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
 CONFIG, WEIGHTS = "model.json", "model.safetensors"
 ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
-RECIPE = "lp_framework"  # key in a checkpoint: the configs of model and backbone
 
 
 # ---------------------------------------------------------------- reading and writing
-
-
-class KeepRecipe(Callback):
-    """Writes the configs of model and backbone, by registered name, into every checkpoint."""
-
-    def __init__(self, model: Mapping[str, Any], backbone: Mapping[str, Any]) -> None:
-        self.recipe = {"model": dict(model), "backbone": dict(backbone)}
-
-    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Called by Lightning."""
-        checkpoint[RECIPE] = self.recipe
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

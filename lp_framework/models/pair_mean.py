@@ -26,8 +26,8 @@ class HostMetric(Metric):
 
     full_state_update = False
 
-    def __init__(self, **arguments: Any) -> None:
-        super().__init__(dist_sync_fn=gathered, **arguments)
+    def __init__(self) -> None:
+        super().__init__(dist_sync_fn=gathered)
 
     def _apply(self, *_: Any, **__: Any) -> HostMetric:
         """Called by `torch.nn.Module` to move it."""
@@ -47,8 +47,8 @@ class PairMean(HostMetric):
     pair: list[Tensor]
     value: list[Tensor]
 
-    def __init__(self, **arguments: Any) -> None:
-        super().__init__(**arguments)
+    def __init__(self) -> None:
+        super().__init__()
         self.add_state("pair", [], dist_reduce_fx="cat")
         self.add_state("value", [], dist_reduce_fx="cat")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -13,11 +14,14 @@ from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError, check_settings
 from lp_framework.models.backbones import Backbone
 
+RECIPE = "lp_framework"  # key in a checkpoint: the configs of model and backbone, by registered name
 WEIGHTS = {"state_dict", "current_model_state"}  # where a checkpoint has weights; the second is of a moving average
 
 
 class TrainedModule(LightningModule):
-    """A LightningModule on a backbone."""
+    """A LightningModule on a backbone. With its `recipe` every checkpoint tells how to build it again."""
+
+    recipe: Mapping[str, Any] | None = None
 
     def __init__(
         self,
@@ -80,6 +84,7 @@ class TrainedModule(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A frozen trunk comes with its backbone: its fingerprint is kept, its weights are left out."""
+        checkpoint[RECIPE] = self.recipe
         if not self.backbone.frozen:
             return
         checkpoint["trunk"] = self.backbone.fingerprint()
