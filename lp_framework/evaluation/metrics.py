@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
@@ -50,22 +51,10 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
             turned = degrees <= threshold
             metrics[f"{prefix}@{threshold}"] = (turned & (distance <= TRANSLATION_THRESHOLD)).double().mean().item()
             metrics[f"{prefix}(R)@{threshold}"] = turned.double().mean().item()
-    metrics["rotation_error"] = median(rotation.gather(1, pick))
-    metrics["translation_error"] = median(translation.gather(1, pick))
+    for name, values in (("rotation_error", rotation), ("translation_error", translation)):
+        # Of an even count the mean of the middle two; torch's median takes the lower one.
+        metrics[name] = float(np.median(values.gather(1, pick).double().numpy()))
     return metrics
-
-
-def median(values: Tensor) -> float:
-    """The median, of an even count the mean of the middle two; infinity is a value like others.
-
-    (torch's `median` takes the lower one of an even count, its `quantile` makes infinity NaN.)
-
-    >>> median(torch.tensor([3.0, 1.0, torch.inf, 2.0]))
-    2.5
-    """
-    ordered = values.flatten().double().sort().values
-    middle = len(ordered) // 2
-    return ordered[middle].item() if len(ordered) % 2 else ordered[middle - 1 : middle + 1].mean().item()
 
 
 class PoseMetrics(HostMetric):

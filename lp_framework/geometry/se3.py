@@ -38,16 +38,8 @@ def _even_function(squared: Tensor, closed_form: Callable[[Tensor], Tensor], ser
     return torch.where(near, total, closed_form(squared.masked_fill(near, 1.0).sqrt()))
 
 
-def _sin_ratio(squared: Tensor) -> Tensor:
-    return _even_function(squared, lambda t: t.sin() / t, _SIN_SERIES)
-
-
 def _cos_ratio(squared: Tensor) -> Tensor:
     return _even_function(squared, lambda t: 2 * ((t / 2).sin() / t).square(), _COS_SERIES)
-
-
-def _cubic_ratio(squared: Tensor) -> Tensor:
-    return _even_function(squared, lambda t: (t - t.sin()) / t**3, _CUBIC_SERIES)
 
 
 def hat(omega: Tensor) -> Tensor:
@@ -72,7 +64,7 @@ def so3_exp(omega: Tensor) -> Tensor:
             [-0.5000,  0.0000,  0.8660]])
     """
     squared = omega.square().sum(-1, keepdim=True)[..., None]
-    first, second = _sin_ratio(squared), _cos_ratio(squared)
+    first, second = _even_function(squared, lambda t: t.sin() / t, _SIN_SERIES), _cos_ratio(squared)
     identity = torch.eye(3, dtype=omega.dtype, device=omega.device)
     # hat(omega)^2 = omega omega^T - |omega|^2 I
     outer = omega[..., :, None] * omega[..., None, :]
@@ -138,7 +130,7 @@ def se3_exp(xi: Tensor) -> Tensor:
     """
     rho, omega = xi.split(3, dim=-1)
     squared = omega.square().sum(-1, keepdim=True)
-    second, third = _cos_ratio(squared), _cubic_ratio(squared)
+    second, third = _cos_ratio(squared), _even_function(squared, lambda t: (t - t.sin()) / t**3, _CUBIC_SERIES)
     # V rho with V = I + second * hat(omega) + third * hat(omega)^2
     turned = torch.linalg.cross(omega, rho, dim=-1)
     translation = rho + second * turned + third * torch.linalg.cross(omega, turned, dim=-1)
