@@ -574,12 +574,6 @@ def test_a_full_disk_is_a_user_error_and_keeps_what_is_finished(tmp_path, monkey
     assert len(contents(tmp_path / "first")) == 11 + 2 + 1
 
 
-@pytest.mark.parametrize("name", ["", "..", "a/b"])
-def test_names_that_cannot_be_folders(tmp_path, name):
-    with pytest.raises(UserError, match="cannot be an object's name"):
-        render_object(*objects_named(name), tmp_path, SMALL, FlatRenderer())
-
-
 def test_equal_names_are_refused(tmp_path):
     with pytest.raises(UserError, match="same name: cube"):
         render_objects(objects_named("cube", "ball", "cube"), tmp_path, SMALL, FlatRenderer())

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lp_framework.data.meshes import Surface, srgb_to_linear, surfaces
 from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, View, downsample
-from lp_framework.errors import UserError
+from lp_framework.errors import optional_import
 from lp_framework.registry import register
 
 RAYS_AT_ONCE = 2**18  # bounds the memory
@@ -29,17 +29,14 @@ class RaycastRenderer(Renderer):
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> Iterator[View]:
-        try:
-            from trimesh.ray.ray_pyembree import RayMeshIntersector
-        except ImportError as error:
-            raise UserError("renderer=raycast needs the Python package embreex: pip install embreex") from error
+        embree = optional_import("trimesh.ray.ray_pyembree", "renderer=raycast", "pip install embreex")
         parts = [_Part(surface) for surface in surfaces(scene)]
         corners = np.concatenate([part.surface.positions for part in parts]).astype(np.float64)
         mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
         twins = np.concatenate([part.surface.twins for part in parts])
         first_triangle = np.cumsum([0, *(len(part.origin) for part in parts)])
         normals = np.concatenate([part.normal for part in parts])
-        intersector = RayMeshIntersector(mesh)
+        intersector = embree.RayMeshIntersector(mesh)
         side = resolution * SUPERSAMPLING
         step = 2 * np.tan(np.radians(field_of_view_degrees) / 2) / side  # of a sample, on the image plane at depth 1
         for pose in np.asarray(camera_to_world, dtype=np.float64):

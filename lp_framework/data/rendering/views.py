@@ -126,8 +126,6 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
     the same protocol, or when it cannot be written; nothing of the object is left then.
     """
     folder = Path(root) / obj.name
-    if obj.name in ("", ".", "..") or Path(obj.name).name != obj.name:
-        raise UserError(f"'{obj.name}' cannot be an object's name, because it cannot be a folder's")
     scene = obj.load()
     mesh, settings = fingerprint(scene), asdict(protocol)
     if folder.exists():

@@ -94,9 +94,6 @@ def read_safetensors(path: Path) -> dict[str, StoredTensor]:
         raise UserError(f"{path}: is no safetensors file, or is cut short; download it again ({error})") from error
 
 
-# ---------------------------------------------------------------- files of torch.save
-
-
 def read_state_dict(path: Path) -> dict[str, StoredTensor]:
     """The tensors of a checkpoint's `state_dict`, or of a file that is nothing but one, by name.
 
@@ -107,8 +104,6 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
             contents = _Unpickler(path, archive, file).load()
     except UserError:
         raise
-    except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from error
     except zipfile.BadZipFile as error:
@@ -119,9 +114,8 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
         raise UserError(f"{path}: its description of the tensors is damaged; download it again") from error
     if isinstance(contents, Mapping) and isinstance(contents.get("state_dict"), Mapping):
         contents = contents["state_dict"]
-    if not isinstance(contents, Mapping):
-        raise UserError(f"{path}: holds no 'state_dict'; a checkpoint with named tensors is wanted")
-    tensors = {str(name): value for name, value in contents.items() if isinstance(value, StoredTensor)}
+    named = contents.items() if isinstance(contents, Mapping) else ()
+    tensors = {str(name): value for name, value in named if isinstance(value, StoredTensor)}
     if not tensors:
         raise UserError(f"{path}: holds no named tensors; a checkpoint with a 'state_dict' is wanted")
     return tensors
