@@ -26,6 +26,7 @@ class Listed(NamedTuple):
 
     number: int
     folder: Path
+    heading: str
     part: RunPart
     content: str | None
 
@@ -36,42 +37,46 @@ def write_run_page(folder: Path, kind: Kind) -> Path:
 
 
 def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> Path:
-    """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened."""
-    if len(runs) == 1:
-        folder, kind = runs[0]
-        part = PARTS[kind][1](folder)
-        *sections, configuration = part.sections
-        return _write(path, replace(part, sections=[*sections, *above, configuration]))
-    listed: dict[str, list[Listed]] = {}
-    size = 0
-    for number, (folder, kind) in enumerate(runs):
-        heading, part_of = PARTS[kind]
-        part = part_of(folder)
-        content = render("run.html.j2", part=part)
-        fits = size + len(content) <= LARGEST
-        size += len(content) if fits else 0
-        listed.setdefault(heading, []).append(Listed(number, folder, part, content if fits else None))
-    tables = [Section(heading, render("runs.html.j2", caption=heading, runs=some)) for heading, some in listed.items()]
-    in_order = sorted((run for some in listed.values() for run in some), key=lambda run: run.number)
-    opened = render("opened.html.j2", runs=in_order)
-    sections = [*above, *tables, Section("Run by run", opened)]
-    return _write(path, RunPart("Report", f"{len(runs)} runs", {}, sections))
+    """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened.
 
-
-def _write(path: Path, part: RunPart) -> Path:
-    """Write the page whole or not at all."""
+    It is written whole or not at all.
+    """
+    part = _one(*runs[0], above) if len(runs) == 1 else _several(runs, above)
     templates = resources.files("lp_framework.report") / "templates"
-    drawn = any("data-figure=" in section.content for section in part.sections)
     text = render(
         "page.html.j2",
         part=part,
         style=(templates / "page.css").read_text(encoding="utf-8"),
         script=(templates / "page.js").read_text(encoding="utf-8"),
-        plotly=_plotly() if drawn else "",
+        plotly=_plotly() if any("data-figure=" in section.content for section in part.sections) else "",
         version=importlib.metadata.version("lp_framework"),
     )
     write_text(path, text)
     return path
+
+
+def _one(folder: Path, kind: Kind, above: Sequence[Section]) -> RunPart:
+    part = PARTS[kind][1](folder)
+    *sections, configuration = part.sections
+    return replace(part, sections=[*sections, *above, configuration])
+
+
+def _several(runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> RunPart:
+    listed: list[Listed] = []
+    room = LARGEST
+    for number, (folder, kind) in enumerate(runs):
+        heading, part_of = PARTS[kind]
+        part = part_of(folder)
+        content = render("run.html.j2", part=part)
+        fits = len(content) <= room
+        room -= len(content) if fits else 0
+        listed.append(Listed(number, folder, heading, part, content if fits else None))
+    sections = [*above]
+    for heading in dict.fromkeys(run.heading for run in listed):
+        some = [run for run in listed if run.heading == heading]
+        sections.append(Section(heading, render("runs.html.j2", caption=heading, runs=some)))
+    sections.append(Section("Run by run", render("opened.html.j2", runs=listed)))
+    return RunPart("Report", f"{len(runs)} runs", {}, sections)
 
 
 @cache

@@ -13,9 +13,8 @@ from rich.table import Table
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
-from lp_framework.report.paper import PaperRow
 from lp_framework.report.runs import COSTS
-from lp_framework.report.sweep_tables import Row, Spread, SweepTable, in_order, spreads
+from lp_framework.report.sweep_tables import Spread, SweepTable, in_order
 
 METRICS = [*COLUMNS, *ERRORS, *COSTS]
 HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passes"], strict=True))
@@ -101,15 +100,10 @@ def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]
     columns += [f"{name}{part}" for name in METRICS for part in ("", "_std")]
     rows: list[list[object]] = []
     for table in tables:
-        lines: list[Row | PaperRow] = [*table.rows, *(table.paper.rows if table.paper else [])]
-        for line in lines:
-            if isinstance(line, PaperRow):
-                source, seeds, pairs = f"paper: {line.label}", None, None
-            else:
-                source, seeds, pairs = "runs", len(line.seeds), line.pairs
-            metrics = [_rounded(each) for name in METRICS for each in spreads(line).get(name, (None, None))]
-            settings = [line.settings.get(key) for key in keys]
-            rows.append([table.experiment, source, *settings, seeds, pairs, *metrics])
+        for row in [*table.rows, *table.all_papers()]:
+            settings = [row.settings.get(key) for key in keys]
+            metrics = [_rounded(each) for name in METRICS for each in row.metrics.get(name, (None, None))]
+            rows.append([table.experiment, row.source, *settings, len(row.runs) or None, row.pairs, *metrics])
     return columns, rows
 
 
@@ -117,12 +111,11 @@ def _down(table: SweepTable) -> Layout:
     """A line a row, the metrics across."""
     labels = [*map(heading, table.columns), "runs"]
     lines = []
-    for line in table.with_paper():
-        if paper := isinstance(line, PaperRow):
-            cells = [f"paper: {line.label}"] + [""] * len(table.columns)
-        else:
-            cells = [shown(line.settings.get(key)) for key in table.columns] + [str(len(line.seeds))]
-        lines.append(Line([*cells, *(_cell(name, spreads(line).get(name)) for name in PRINTED)], paper))
+    for row in table.with_paper():
+        cells = [shown(row.settings.get(key)) for key in table.columns] + [str(len(row.runs))]
+        if row.paper:
+            cells = [row.source] + [""] * len(table.columns)
+        lines.append(Line([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
     return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
 
 
@@ -133,12 +126,10 @@ def _across(table: SweepTable, axis: str) -> Layout:
     lines = []
     for group in table.apart_from(axis):
         settings = group[0].settings
-        ours = [[spreads(row) for row in group if row.settings.get(axis) == value] for value in values]
-        theirs = [[spreads(row) for row in table.papers({**settings, axis: value})] for value in values]
-        told = [
-            *(shown(settings.get(key)) for key in others),
-            "-".join(map(str, sorted({len(row.seeds) for row in group}))),
-        ]
+        ours = [[row.metrics for row in group if row.settings.get(axis) == value] for value in values]
+        theirs = [[row.metrics for row in table.papers({**settings, axis: value})] for value in values]
+        counts = "-".join(map(str, sorted({len(row.runs) for row in group})))
+        told = [*(shown(settings.get(key)) for key in others), counts]
         for name in ACROSS[axis]:
             for columns, labels, paper in ((ours, told, False), (theirs, ["paper", *[""] * len(others)], True)):
                 found = [next((each[name] for each in column if name in each), None) for column in columns]

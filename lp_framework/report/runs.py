@@ -81,7 +81,7 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
 
     Raises `UserError` for a folder that is not there.
     """
-    runs: list[Run] = []
+    runs: dict[str, Run] = {}
     left_out: list[LeftOut] = []
     for folder in [folder for folder, kind in run_folders(folders) if kind == "eval"]:
         try:
@@ -89,13 +89,10 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
         except UserError as error:
             left_out.append(LeftOut(folder, str(error)))
             continue
-        it = run.settings, run.seed, run.checkpoint, run.experiment
-        same = next((one for one in runs if (one.settings, one.seed, one.checkpoint, one.experiment) == it), None)
-        if same is None:
-            runs.append(run)
-        else:
-            left_out.append(LeftOut(folder, f"repeats {same.folder}: the same settings and seed"))
-    return runs, left_out
+        first = runs.setdefault(json.dumps([run.settings, run.seed, run.checkpoint, run.experiment]), run)
+        if first is not run:
+            left_out.append(LeftOut(folder, f"repeats {first.folder}: the same settings and seed"))
+    return [*runs.values()], left_out
 
 
 def read_run(folder: Path) -> Run:

@@ -10,9 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
-from lp_framework.report.paper import PaperRow
 from lp_framework.report.printed_tables import heading, shown
-from lp_framework.report.sweep_tables import Row, Spread, SweepTable, spreads
+from lp_framework.report.sweep_tables import Row, Spread, SweepTable
 from lp_framework.viz.sweeps import COLOURS, Curve, Entry, Panel, curves_figure, entries_figure
 
 AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins
@@ -36,10 +35,10 @@ def sweep_figure(table: SweepTable) -> Figure | None:
     if len(table.rows) < 2 and table.paper is None:
         return None
     entries: list[Entry] = []
-    for line in table.with_paper():
-        named = f"paper: {line.label}" if isinstance(line, PaperRow) else label(line.settings)
+    for row in table.with_paper():
+        named = row.source if row.paper else label(row.settings)
         if named not in [entry.label for entry in entries]:
-            entries.append(Entry(named, spreads(line), isinstance(line, PaperRow)))
+            entries.append(Entry(named, row.metrics, row.paper))
     return entries_figure(entries, PANELS, paper)
 
 
@@ -97,43 +96,37 @@ def _called(table: SweepTable, row: Row) -> str:
 
 def _panels(table: SweepTable, axis: str) -> list[Panel]:
     if axis == "views":
-        return [Panel(name, "number of images", _curves(table, axis, {"": name})) for name in ("R@15", "R@30")]
+        return [_panel(table, axis, name, "number of images", {"": name}) for name in ("R@15", "R@30")]
     if axis == "start.count":
         first, *_, last = sorted({row.settings[axis] for row in table.rows})
-        title = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
-        return [
-            Panel("R@30 by number of starts", "number of starts", _curves(table, axis, {"": "R@30"})),
-            Panel(title, TIME, _curves(table, axis, {"": "R@30"}, by_time=True), logarithmic=True),
-        ]
+        by_time = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
+        by_count = _panel(table, axis, "R@30 by number of starts", "number of starts", {"": "R@30"})
+        return [by_count, _panel(table, axis, by_time, TIME, {"": "R@30"}, by_time=True)]
     if len(table.apart_from(axis)) > 1:  # a colour each
-        return [
-            Panel(f"{title}, {WITHIN[-1]}", NOISE, _curves(table, axis, {"": names[-1]}))
-            for title, names in PANELS.items()
-        ]
-    return [
-        Panel(title, NOISE, _curves(table, axis, dict(zip(WITHIN, names, strict=True))))
-        for title, names in PANELS.items()
-    ]
+        return [_panel(table, axis, f"{title}, {WITHIN[-1]}", NOISE, {"": each[-1]}) for title, each in PANELS.items()]
+    return [_panel(table, axis, title, NOISE, dict(zip(WITHIN, each, strict=True))) for title, each in PANELS.items()]
 
 
-def _curves(table: SweepTable, axis: str, metrics: Mapping[str, str], by_time: bool = False) -> list[Curve]:
+def _panel(
+    table: SweepTable, axis: str, title: str, xlabel: str, metrics: Mapping[str, str], by_time: bool = False
+) -> Panel:
     """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's,
     over the values of `axis` or over the seconds a pair.
     """
-    curves = []
+    curves, over = [], None if by_time else axis
     for rows in table.apart_from(axis):
         words = label({key: value for key, value in rows[0].settings.items() if key != axis})
         papers = [each for row in rows for each in table.papers(row.settings)]
         for extra, name in metrics.items():
-            title = ", ".join(filter(None, [words, extra]))
-            curves.append(_curve(title, rows, None if by_time else axis, name))
+            called = ", ".join(filter(None, [words, extra]))
+            curves.append(_curve(called, rows, over, name))
             if theirs := [each for each in papers if name in each.metrics]:
-                curves.append(_curve(title, theirs, None if by_time else axis, name))
-    return curves
+                curves.append(_curve(called, theirs, over, name))
+    return Panel(title, xlabel, curves, logarithmic=by_time)
 
 
-def _curve(title: str, lines: Sequence[Row | PaperRow], axis: str | None, metric: str) -> Curve:
+def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:
     """A metric of rows over a setting, or over the seconds a pair."""
-    x = [spreads(line).get(SECONDS, NONE).mean if axis is None else float(line.settings[axis]) for line in lines]
-    mean, std = np.array([spreads(line)[metric] for line in lines]).T
-    return Curve(title, np.array(x), mean, std, isinstance(lines[0], PaperRow))
+    x = [row.metrics.get(SECONDS, NONE).mean if axis is None else float(row.settings[axis]) for row in rows]
+    mean, std = np.array([row.metrics[metric] for row in rows]).T
+    return Curve(title, np.array(x), mean, std, rows[0].paper)

@@ -24,13 +24,22 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """The runs that differ in nothing but their seeds: what was set, of the table's columns, and the metrics."""
+    """The runs that differ in nothing but their seeds: what was set, of the table's columns, and the metrics.
+
+    Or a row of the paper, with its `source`, and no runs.
+    """
 
     settings: Mapping[str, Any]
     metrics: Mapping[str, Spread]
-    seeds: Sequence[int]
-    runs: Sequence[str]  # their folders
-    pairs: int
+    seeds: Sequence[int] = ()
+    runs: Sequence[str] = ()  # their folders
+    pairs: int | None = None
+    source: str = "runs"
+
+    @property
+    def paper(self) -> bool:
+        """Whether it is the paper's."""
+        return not self.runs
 
 
 @dataclass(frozen=True)
@@ -55,23 +64,23 @@ class SweepTable:
             groups.setdefault(json.dumps([row.settings.get(key) for key in others]), []).append(row)
         return list(groups.values())
 
-    def papers(self, settings: Mapping[str, Any]) -> list[PaperRow]:
+    def papers(self, settings: Mapping[str, Any]) -> list[Row]:
         """The paper's rows to compare a run of these settings with."""
-        return [] if self.paper is None else self.paper.matching(settings)
+        return [] if self.paper is None else [_printed(each) for each in self.paper.matching(settings)]
 
-    def with_paper(self) -> list[Row | PaperRow]:
+    def with_paper(self) -> list[Row]:
         """The rows, each followed by the paper's to compare it with; the rest of the paper's are last."""
-        lines: list[Row | PaperRow] = []
-        for row in self.rows:
-            lines += [row, *self.papers(row.settings)]
-        return lines + [each for each in (self.paper.rows if self.paper else []) if each not in lines]
+        rows = [each for row in self.rows for each in (row, *self.papers(row.settings))]
+        return rows + [each for each in self.all_papers() if each not in rows]
+
+    def all_papers(self) -> list[Row]:
+        """The paper's rows."""
+        return [] if self.paper is None else [_printed(each) for each in self.paper.rows]
 
 
-def spreads(line: Row | PaperRow) -> Mapping[str, Spread]:
-    """The metrics of a row; a number of the paper has no spread."""
-    if isinstance(line, Row):
-        return line.metrics
-    return {name: Spread(value, math.nan) for name, value in line.metrics.items()}
+def _printed(row: PaperRow) -> Row:
+    metrics = {name: Spread(value, math.nan) for name, value in row.metrics.items()}
+    return Row(row.settings, metrics, source=f"paper: {row.label}")
 
 
 def sweep_tables(runs: Sequence[Run], objects: Objects) -> tuple[list[SweepTable], list[LeftOut]]:
