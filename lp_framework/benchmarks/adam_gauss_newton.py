@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,19 +25,6 @@ CONTENDERS = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
 PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
 PROBE_NOISES = 2  # a timestep
 PROBE_SEED = 1  # the solvers' is 0
-
-
-@dataclass(frozen=True)
-class Descent:
-    """At the start and after each step: `energies` on the probe, the mean over pairs and starts, and the network
-    `passes` a start so far."""
-
-    energies: Sequence[float]
-    passes: Sequence[float]
-
-    def reached(self, level: float) -> int:
-        """The first step after which the energy is no higher."""
-        return next(step for step, energy in enumerate(self.energies) if energy <= level)
 
 
 def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
@@ -68,22 +54,23 @@ def measure(
             followed(ready, chosen, newton.refine(chosen, ends, 0), looks=1),
             followed(ready, chosen, adam.solve(chosen, ends, 0), looks=0),
         )
-        level = max(min(descent.energies) for descent in descents)
-        steps = [descent.reached(level) for descent in descents]
-        passes = [descent.passes[step] for descent, step in zip(descents, steps, strict=True)]
-        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *passes)
-        names = section.contenders
+        level = max(min(energies) for energies, _ in descents)
+        steps = [next(step for step, each in enumerate(energies) if each <= level) for energies, _ in descents]
+        reached = [passes[step] for (_, passes), step in zip(descents, steps, strict=True)]
+        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *reached)
         section.facts[f"gamma {gamma:g}"] = {
-            "energy": {"start": descents[1].energies[0], "equal": level},
-            "steps": dict(zip(names, steps, strict=True)),
-            "energies": {name: list(descent.energies) for name, descent in zip(names, descents, strict=True)},
+            "energy": {"start": descents[1][0][0], "equal": level},
+            "steps": dict(zip(section.contenders, steps, strict=True)),
+            "energies": {name: each for name, (each, _) in zip(section.contenders, descents, strict=True)},
         }
         section.changed()
 
 
-def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> Descent:
-    """The descent of a solution with its trajectory; before its first step it has passed the network `looks` times as
-    often as in each."""
+def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
+    """Of a solution with its trajectory, at the start and after each step: energies on the probe, the mean over pairs
+    and starts, and the network passes a start so far. Before its first step it has passed the network `looks` times as
+    often as in each.
+    """
     path = solution.trajectory
     assert path is not None  # it was asked for
     energy = PairEnergy(prior, pairs, PROBE_SEED)
@@ -92,4 +79,4 @@ def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> Desc
     energies = [energy.mean(poses, timesteps, noise).mean().item() for poses in path.unbind(dim=2)]
     steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
     passes = (solution.cost.network_passes - len(pairs.images)) / starts  # the images have been encoded before
-    return Descent(energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)])
+    return energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)]

@@ -15,30 +15,11 @@ Work = Callable[[], float]  # does it, and returns how many of the row's unit we
 _Result = TypeVar("_Result")
 
 
-@dataclass(frozen=True)
-class Row:
-    """A quantity of two contenders, of each a value a round, or a single one."""
-
-    first: list[float] = field(default_factory=list)
-    second: list[float] = field(default_factory=list)
-
-    @property
-    def medians(self) -> tuple[float, float]:
-        """Those of the two contenders."""
-        return median(self.first), median(self.second)
-
-    @property
-    def ratio(self) -> float:
-        """First over second."""
-        first, second = self.medians
-        return first / second
-
-
 @dataclass
 class Section:
     """A measurement so far: `rows` by label with their unit, `facts` for the JSON file alone.
 
-    `changed` is called after every stretch of work.
+    A row has of either contender a value a round, or a single one. `changed` is called after every stretch of work.
     """
 
     title: str
@@ -46,7 +27,7 @@ class Section:
     device: torch.device
     changed: Callable[[], None] = lambda: None
     note: str = ""
-    rows: dict[str, Row] = field(default_factory=dict)
+    rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
 
     def race(
@@ -61,32 +42,27 @@ class Section:
             second()
         for _ in range(rounds):
             for label, both in works.items():
-                row = self.rows.setdefault(label, Row())
-                for work, values in zip(both, (row.first, row.second), strict=True):
+                for work, values in zip(both, self.rows.setdefault(label, ([], [])), strict=True):
                     seconds, amount = timed(work, self.device)
                     values.append(amount / seconds if rate else seconds / amount)
                     self.changed()
 
     def add(self, label: str, first: float, second: float) -> None:
         """A row of single values."""
-        self.rows[label] = Row([first], [second])
+        self.rows[label] = [first], [second]
 
-    def measured(self) -> dict[str, Row]:
-        """The rows of which both contenders have a value."""
-        return {label: row for label, row in self.rows.items() if row.first and row.second}
+    def medians(self) -> dict[str, tuple[float, float]]:
+        """Of the rows of which both contenders have a value."""
+        return {label: (median(first), median(second)) for label, (first, second) in self.rows.items() if second}
 
     def record(self) -> dict[str, Any]:
         """For the JSON file: by the labels of the rows, and the facts."""
-        first, second = self.contenders
-        rows = {
-            label: {first: _spread(row.first), second: _spread(row.second), "ratio": row.ratio}
-            for label, row in self.measured().items()
-        }
+        rows: dict[str, Any] = {}
+        for label, (first, second) in self.medians().items():
+            rows[label] = {"ratio": first / second}
+            for name, values in zip(self.contenders, self.rows[label], strict=True):
+                rows[label][name] = {"median": median(values), "min": min(values), "max": max(values), "rounds": values}
         return {**rows, **self.facts}
-
-
-def _spread(values: list[float]) -> dict[str, Any]:
-    return {"median": median(values), "min": min(values), "max": max(values), "rounds": list(values)}
 
 
 def worth(amount: float, do: Callable[[], object]) -> Work:

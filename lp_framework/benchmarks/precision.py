@@ -68,7 +68,7 @@ def measure(
         section.facts[words] = {"gradient_deviation": off, "peak_operations_per_second": peaks[0]}
         label = f"{words}: seconds a step"
         section.race({label: (batched(theirs, pair, poses, steps), batched(ready, pair, poses, steps))}, rounds)
-        seconds = section.rows[label].medians
+        seconds = section.medians()[label]
         shares = (operations / each / peak for each, peak in zip(seconds, peaks, strict=True))
         section.add(f"{words}: share of peak", *shares)
         if device.type == "cuda":

@@ -12,7 +12,7 @@ import torch
 
 from lp_framework.benchmarks.counting import peak_bytes
 from lp_framework.benchmarks.first_stage import random_images
-from lp_framework.benchmarks.harness import Row, Section, timed
+from lp_framework.benchmarks.harness import Section, timed
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
@@ -54,7 +54,7 @@ def measure(
         slopes = {"seconds": exponent(medians), "peak_bytes": exponent(peaks)}
         least, most = min(sizes), max(sizes)
         label = f"{least} to {most} {name}"
-        section.rows[f"{label}: seconds, exponent {slopes['seconds']:.2f}"] = Row(seconds[most], seconds[least])
+        section.rows[f"{label}: seconds, exponent {slopes['seconds']:.2f}"] = seconds[most], seconds[least]
         memory = f"{label}: peak memory, MB, exponent {slopes['peak_bytes']:.2f}"
         section.add(memory, peaks[most] / 1e6, peaks[least] / 1e6)
         costs = {size: {"seconds": medians[size], "peak_bytes": peaks[size]} for size in sizes}

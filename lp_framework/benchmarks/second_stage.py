@@ -39,10 +39,6 @@ class Arithmetic(NamedTuple):
     peak: float
     launches: int | None = None  # where they were counted
 
-    def __str__(self) -> str:
-        launches = "" if self.launches is None else f" in {self.launches:,} launches"
-        return f"{self.operations / 1e9:.3g} GFLOP{launches}, the device's peak {self.peak / 1e12:.3g} TFLOP/s"
-
 
 def measure_step(section: Section, computing: Computing, starts: Sequence[int], rounds: int, steps: int) -> None:
     """`rounds` of `steps` optimisation steps with each number of `starts`, on random weights.
@@ -70,7 +66,7 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     section.note = (
         f"Zero123's {computing.architecture} size, random weights. {BATCHED}: all starts and both directions "
         f"together, images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images anew each "
-        "step; " + "; ".join(f"{name}: a start's step is {each}" for name, each in arithmetic.items())
+        "step; " + "; ".join(f"{name}: a start's step is {_in_words(each)}" for name, each in arithmetic.items())
     )
     section.facts = {
         "encoding_seconds": encoding,
@@ -85,10 +81,8 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     }
     section.race(works, rounds, warm_up=False)
     for count, label in zip(starts, works, strict=True):
-        medians = zip(arithmetic.values(), section.rows[label].medians, strict=True)
-        section.add(
-            f"{told(count)}, share of peak", *(count * a.operations / seconds / a.peak for a, seconds in medians)
-        )
+        both = zip(arithmetic.values(), section.medians()[label], strict=True)
+        section.add(f"{told(count)}, share of peak", *(count * a.operations / seconds / a.peak for a, seconds in both))
 
 
 def measure_pair(
@@ -121,6 +115,11 @@ def measure_pair(
     )
     works = {f"{told(count)}, seconds a pair": (work, worth(1, partial(plain, count))) for count, work in ours.items()}
     section.race(works, rounds, warm_up=False)
+
+
+def _in_words(work: Arithmetic) -> str:
+    launches = f" in {work.launches:,} launches" if work.launches else ""
+    return f"{work.operations / 1e9:.3g} GFLOP{launches}, the device's peak {work.peak / 1e12:.3g} TFLOP/s"
 
 
 def told(starts: int) -> str:

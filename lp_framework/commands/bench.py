@@ -163,8 +163,8 @@ def table(sections: list[Section]) -> Table:
         result.add_column(justify="right")
     for section in sections:
         result.add_row(section.title, *section.contenders, "ratio", style="bold")
-        for label, row in section.measured().items():
-            result.add_row(label, *map(_number, row.medians), f"{row.ratio:.3g} x")
+        for label, (first, second) in section.medians().items():
+            result.add_row(label, _number(first), _number(second), f"{first / second:.3g} x")
         result.add_section()
     return result
 
