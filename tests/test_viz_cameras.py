@@ -40,7 +40,7 @@ def figure_of(poses: NDArray) -> Figure:
 
 
 def test_the_projection_is_parallel_with_up_upwards():
-    view = Scene(viewpoint(0.4, 0.7), np.zeros((1, 3)), 1.0, 1.0)
+    view = Scene(viewpoint(0.4, 0.7), np.zeros((1, 3)), 1.0)
     towards = camera_to_world(torch.tensor([0.4, 0.7, 1.0], dtype=torch.float64))[:3, 3].numpy()
     np.testing.assert_allclose(view.project(towards), 0, atol=1e-12)
     assert view.nearness(towards) == pytest.approx(1) and view.nearness(-towards) == pytest.approx(-1)

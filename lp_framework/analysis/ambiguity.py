@@ -1,9 +1,7 @@
 """How well a prior's energy singles out the azimuth of an object, and how far its views leave it open.
 
-The first thing to know of a prior and an object, before anything is trained. A narrow valley at the truth and nothing
-else: any start will do. A second valley at half a turn: the shape looks the same from behind. No valley: no method can
-tell the longitude. The *valley floor* is the lowest ground at each longitude, in the range of its landscape; its mean
-over pairs, each turned so that the truth is at 0, is what the object itself has of valleys.
+The *valley floor* is the lowest ground at each longitude, in the range of its landscape; its mean over pairs, each
+turned so that the truth is at 0, is what the object itself has of valleys.
 """
 
 from __future__ import annotations

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich import box
@@ -65,8 +65,9 @@ def run(config: DictConfig) -> None:
         data = components["data"]
         data.evaluate_on(config.protocol, config.seed)
         data.prepare_data()
-        record = overview(data, components["prior"].to(device), device, draws, grid, config.azimuths, config.protocol)
-        write_overview(console, config, folder, record)
+        found = overview(data, components["prior"].to(device), device, draws, grid, config.azimuths, config.protocol)
+        table, results = overview_table(f"{config.data.name}, prior={config.prior.name}", found), "azimuth.json"
+        figures = {"azimuth": azimuth_figure(found["objects"])}
     else:
         if config.images is not None:
             pairs, pair = photographs(config, device)
@@ -78,16 +79,18 @@ def run(config: DictConfig) -> None:
         starts = components["start"].make(pairs, config.seed)
         with shown_progress():
             pair, views, field = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
+        checkpoint, method = components.checkpoint, words(config.solver.name)
+        found = {**summary(pair), "checkpoint": str(checkpoint) if checkpoint else None, "seed": config.seed}
+        table, results = pair_table(f"{pair.object}, prior={config.prior.name}", method, found), "landscape.json"
         write_arrays(folder / "landscape.npz", landscape_arrays(pair, field))
-        checkpoint = str(components.checkpoint) if components.checkpoint else None
-        record = {**summary(pair), "checkpoint": checkpoint, "seed": config.seed}
-        write_json(folder / "landscape.json", {**record, "config": plain(config), "versions": versions()})
-        pictures = save_pictures(folder, config, pair, views, draws)
-        console.print(pair_table(f"{pair.object}, prior={config.prior.name}", words(config.solver.name), record))
-        console.print(f"results: {folder / 'landscape.json'}, landscape.npz", soft_wrap=True)
-        console.print(
-            f"picture: {', '.join([str(pictures[0]), *(each.name for each in pictures[1:])])}", soft_wrap=True
-        )
+        example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
+        save_examples(folder / "pictures" / EXAMPLES, [example])
+        figures = pair_figures(pair, views, draws, f"Energy of prior {config.prior.name}, ways of {method}")
+    write_json(folder / results, {**found, "config": plain(config), "versions": versions()})
+    pictures = [save_figure(figure, folder / name)[0].name for name, figure in figures.items()]
+    console.print(table)
+    console.print(f"results: {folder / results}", soft_wrap=True)
+    console.print(f"picture: {folder}/{', '.join(pictures)}", soft_wrap=True)
     console.print(f"page:    {write_run_page(folder, 'landscape')}", soft_wrap=True)
 
 
@@ -110,14 +113,11 @@ def check(config: DictConfig) -> None:
 # ---------------------------------------------------------------- a pair
 
 
-def save_pictures(
-    folder: Path, config: DictConfig, pair: ShownPair, views: Sequence[NDArray], draws: Draws
-) -> list[Path]:
+def pair_figures(pair: ShownPair, views: Sequence[NDArray], draws: Draws, heading: str) -> dict[str, Figure]:
     """The pictures `landscape`, `surface` and `fields`; the last not of photographs, whose truth is not known."""
-    energy, method = pair.prior_energy, words(config.solver.name)
+    energy = pair.prior_energy
     radius = f"{'' if pair.truth is None else 'true '}relative radius {energy.radius:+.2f}".replace("-", "\u2212")
     note = f"{minima_in_words(energy)} at the {radius}. {draws.in_words()}"
-    heading = f"Energy of prior {config.prior.name}, ways of {method}"
     figures = {
         "landscape": pair_figure(pair, [PoseMap(heading, relief=energy, ways=pair)], pair.object, note, views),
         "surface": surface_figure(energy, pair.truth, pair.object),
@@ -125,9 +125,7 @@ def save_pictures(
     if pair.maps:
         note = "ways of the first stage without noise (langevin, gamma 0)"
         figures["fields"] = pair_figure(pair, pair.maps, pair.object, note)
-    example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
-    save_examples(folder / "pictures" / EXAMPLES, [example])
-    return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
+    return figures
 
 
 def data_pair(config: DictConfig, data: PairDataModule, device: torch.device) -> tuple[Pairs, ShownPair]:
@@ -222,20 +220,8 @@ def pair_table(title: str, method: str, record: dict[str, Any]) -> Table:
 # ---------------------------------------------------------------- all objects
 
 
-def write_overview(console: Console, config: DictConfig, folder: Path, record: dict[str, Any]) -> None:
-    """Write `azimuth.json` and `azimuth.png` into this run's folder, and print a row an object."""
-    write_json(folder / "azimuth.json", {**record, "config": plain(config), "versions": versions()})
-    rows = record["objects"]
-    picture, _ = save_figure(azimuth_figure(rows), folder / "azimuth")
-    console.print(overview_table(f"{config.data.name}, prior={config.prior.name}", record))
-    if unanswered := [row["object"] for row in rows if not row["ambiguity_score"]["unique_answer"]]:
-        console.print(f"without a unique answer to this prior: {', '.join(unanswered)}", soft_wrap=True)
-    console.print(f"results: {folder / 'azimuth.json'}", soft_wrap=True)
-    console.print(f"picture: {picture}", soft_wrap=True)
-
-
 def overview_table(title: str, record: dict[str, Any]) -> Table:
-    """A row an object, then the shares over all of them."""
+    """A row an object, then the shares over all of them; below it the objects without a unique answer."""
     near = f"within {NEAR_DEGREES:g}°"
     columns = ("object", "class", near, "relief", "minima (degrees from truth: height)", "flatness", "verdict")
     table = table_of(title, columns, numbers=(near, "relief", "flatness"))
@@ -250,12 +236,16 @@ def overview_table(title: str, record: dict[str, Any]) -> Table:
     for name, key in (("all objects", "within"), ("unique answer", "within_unique_answer")):
         if record[key] is not None:
             table.add_row(name, "", f"{record[key]:.3f}", "", "")
+    unanswered = [row["object"] for row in record["objects"] if not row["ambiguity_score"]["unique_answer"]]
+    if unanswered:
+        table.caption = f"without a unique answer to this prior: {', '.join(unanswered)}"
     return table
 
 
 def table_of(title: str, columns: Sequence[str], numbers: Sequence[str]) -> Table:
     """An empty table for the terminal; the columns of numbers are to the right."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    look: Any = {"title_justify": "left", "caption_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
+    table = Table(title=title, **look)
     for column in columns:
         table.add_column(column, justify="right" if column in numbers else "left", no_wrap=True)
     return table

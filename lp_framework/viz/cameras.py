@@ -78,9 +78,9 @@ ROUND, SPOKES = _circle(range(0, 361, 2)), _circle(range(0, 360, 30))
 class Scene:
     """What is seen of points `[K, 3]` from a viewpoint, and the ground, the plane of latitude 0, out to `radius`."""
 
-    def __init__(self, view: NDArray, points: NDArray, radius: float, margin: float) -> None:
+    def __init__(self, view: NDArray, points: NDArray, radius: float) -> None:
         self.view, self.radius = view, radius
-        seen = self.project(np.concatenate([points, margin * radius * ROUND]))
+        seen = self.project(np.concatenate([points, 1.13 * radius * ROUND]))
         self.low, self.high = seen.min(axis=0) - 0.06 * radius, seen.max(axis=0) + 0.06 * radius
 
     def project(self, points: NDArray) -> NDArray:
@@ -155,7 +155,7 @@ def cameras_figure(
     distance = furthest * (NEAR_BY if len(poses) <= 5 else 0.8 * NEAR_BY)
     planes = [image_plane(camera, distance, half_angle) for camera in cameras]
     points = np.concatenate([middle, *planes, cameras[:, :3, 3]])
-    scene = Scene(best_viewpoint(poses), points, furthest, margin=1.14)
+    scene = Scene(best_viewpoint(poses), points, furthest)
     colours = [BLUE, *[VERMILION] * (len(poses) - 1)]
     tall, cards = min(TALLEST, scene.height(WIDTH)), min(len(images), MOST_CARDS)
     side = (WIDTH - 2 * SIDE - GAP * (CARD_COLUMNS - 1)) / CARD_COLUMNS
@@ -242,7 +242,7 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
     rows = []
     for each in objects:
         points = _cameras(np.concatenate([each.poses, *(poses.reshape(-1, 3) for poses in each.predicted)]))[:, :3, 3]
-        scene = Scene(best_viewpoint(each.poses), points, float(each.poses[:, 2].max()), margin=1.12)
+        scene = Scene(best_viewpoint(each.poses), points, float(each.poses[:, 2].max()))
         images = math.ceil(len(each.images) / IMAGE_COLUMNS) * (IMAGE + BETWEEN) - BETWEEN
         rows.append((each, scene, images, max(scene.height(wide), images)))
     sheet = Sheet(METHODS_WIDTH, KEY + sum(tall + TITLE + APART for *_, tall in rows))
