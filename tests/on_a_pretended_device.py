@@ -209,9 +209,9 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
         gathered_on.extend({each.device for each in (*evaluation.metrics.pair, *evaluation.metrics.cost)})
         return result(evaluation)
 
-    def save(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
+    def save(folder: Path, evaluation: Evaluation, data: PairData, result: dict[str, Any]) -> list[Path]:
         drawn_on.append(next(evaluation.parameters()).device)
-        return save_pictures(folder, evaluation, data)
+        return save_pictures(folder, evaluation, data, result)
 
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", save)
     monkeypatch.setattr(Evaluation, "result", gathered)

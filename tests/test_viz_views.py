@@ -65,7 +65,7 @@ def test_the_sources_own_pose_is_framed(latitudes, longitudes, corners):
     assert framed(views_figure(SOURCE, views, latitudes, longitudes, "", "")) == corners
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (3, 12), (5, 36), (9, 2)])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (3, 12), (2, 36), (9, 2)])
 def test_views_are_square_and_all_is_on_the_page(rows, columns):
     longitudes = [360 * number / columns for number in range(columns)]
     figure = views_figure(SOURCE, numbered(rows, columns), np.linspace(40, -40, rows), longitudes, "duck", "tiny")

@@ -122,7 +122,7 @@ def write_all(folder: Path, result: dict[str, Any], evaluation: Evaluation, view
     write_result(folder, result, evaluation.metrics, evaluation.table)
     journal.finish()
     wanted = result["config"]["pictures"]
-    print_results(folder, result, save_pictures(folder / "pictures", evaluation, views) if wanted else [])
+    print_results(folder, result, save_pictures(folder / "pictures", evaluation, views, result) if wanted else [])
 
 
 def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,13 +12,12 @@ from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examp
 from lp_framework.analysis.shown import ShownPair
 from lp_framework.data.pairs import PairData
 from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.evaluation.metrics import summarise
 from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
 from lp_framework.viz.maps import pair_figure
 from lp_framework.viz.style import save_figure
 
 
-def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[Path]:
+def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: Mapping[str, Any]) -> list[Path]:
     """After `Trainer.test`: maps of some pairs (failures first), cumulative errors, and the objects, into `folder`.
 
     Each as PNG and PDF; returns the PNG files. Sets of images have no maps. `EXAMPLES` below the folder gets the
@@ -33,7 +34,7 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData) -> list[
     }
     classes = [table.ambiguities[index] for index in rows["object"].tolist()]
     figures["errors"] = errors_figure(rotation, translation, chosen, classes)
-    figures["objects"] = objects_figure(object_cards(evaluation, data))
+    figures["objects"] = objects_figure(object_cards(result["per_object"], data))
     return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
 
 
@@ -44,15 +45,15 @@ def answer_note(pair: ShownPair) -> str:
     return f"{pair.reason}: {'no answer' if np.isnan(degrees) else off}"
 
 
-def object_cards(evaluation: Evaluation, data: PairData) -> list[ObjectCard]:
+def object_cards(per_object: Mapping[str, Mapping[str, float] | None], data: PairData) -> list[ObjectCard]:
     """A card for every object that has pairs, with its first view; no success rate where a pair has one answer."""
-    rows, table, images = evaluation.metrics.rows(), data.table, data.images
+    table, images = data.table, data.images
     assert images is not None  # evaluation never caches features
-    cards = []
-    for index in rows["object"].unique().tolist():
-        mask = rows["object"] == index
-        metrics = summarise(rows["rotation"][mask], rows["translation"][mask], rows["chosen"][mask])
-        image = np.asarray(images[table.views_of(index)[0]])
-        success = None if evaluation.solver.one_answer else metrics["SR(R)@30"]
-        cards.append(ObjectCard(table.names[index], table.ambiguities[index], image, metrics["R(R)@15"], success))
-    return cards
+    return [
+        ObjectCard(
+            name, table.ambiguities[index], np.asarray(images[table.views_of(index)[0]]), metrics["R(R)@15"],
+            metrics.get("SR(R)@30"),
+        )
+        for index, name in enumerate(table.names)
+        if (metrics := per_object[name]) is not None
+    ]  # fmt: skip
