@@ -43,10 +43,10 @@ def main() -> int:
         if command in ("--help", "-h"):
             _print_overview()
         elif command == "--version":
-            print(f"lp_framework {_version()}")
+            print(f"lp_framework {importlib.metadata.version('lp_framework')}")
         elif command not in COMMANDS:
-            print(f"error: there is no command '{command}'{nearest(command, COMMANDS)}", end=" ", file=sys.stderr)
-            print(f"(known: {', '.join(COMMANDS)})", file=sys.stderr)
+            known = f"{nearest(command, COMMANDS)} (known: {', '.join(COMMANDS)})"
+            print(f"error: there is no command '{command}'{known}", file=sys.stderr)
             return 2
         elif command == "plugins":
             from lp_framework.commands import plugins
@@ -70,25 +70,10 @@ def main() -> int:
     return 0
 
 
-def _version() -> str:
-    try:
-        return importlib.metadata.version("lp_framework")
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
-
-
 def _print_overview() -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 10_000)
-    console.print("[bold]lp_framework[/]: the camera viewpoint between photographs of one object\n")
-    console.print("Usage: [bold]python -m lp_framework COMMAND[/] \\[key=value ...], or [bold]lp COMMAND[/] ...\n")
+    print("lp_framework: the camera viewpoint between photographs of one object\n")
+    print("Usage: python -m lp_framework COMMAND [key=value ...], or lp COMMAND ...\n")
     for title, rows in (("Commands", COMMANDS), ("Examples", EXAMPLES)):
-        table = Table(box=None, show_header=False, padding=(0, 2))
-        for left, right in rows.items():
-            table.add_row(f"[cyan]{left}[/]", right)
-        console.print(f"[bold]{title}[/]")
-        console.print(table)
-        console.print()
-    console.print("HYDRA_FULL_ERROR=1 shows the traceback of an error.")
+        width = max(map(len, rows))
+        print(f"{title}\n", *(f"  {left:{width}}  {right}" for left, right in rows.items()), "", sep="\n")
+    print("HYDRA_FULL_ERROR=1 shows the traceback of an error.")

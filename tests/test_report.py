@@ -337,7 +337,10 @@ def test_several_folders_are_one_report(lp, tmp_path):
         (("runs=nowhere",), "runs=nowhere: there is no such folder"),
         (("runs=empty",), "runs=empty: holds no finished run to report, nor an unfinished one"),
         (("runs=stopped",), "runs=stopped: holds no finished run to report: stopped/a is unfinished: no res"),
-        (("runs=good", "objects=unique"), "objects=unique is none of its values; did you mean 'unique_answer'? (kno"),
+        (
+            ("runs=good", "objects=unique"),
+            "objects=unique does not fit; expected one of unique_answer, all; did you mean 'un",
+        ),
         ((), "runs needs a value: give runs=VALUE"),
     ],
 )

@@ -21,7 +21,7 @@ from tiny_runs import Commands, Ran
 from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import SHIPPED, find_checkpoint, latest_checkpoint, load_model, read_checkpoint
 
-EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6", "backbone.pause=0.1")
+EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6")
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +46,17 @@ def whole(commands) -> Ran:
 
 
 @pytest.fixture(scope="module")
-def killed(commands) -> Path:
-    """The same run, killed as soon as its first checkpoint is there."""
-    process = commands.start("killed", "train", *EVERYTHING)
+def killed(commands) -> Ran:
+    """The same run in a process, killed as soon as its first checkpoint is there."""
+    process = commands.start("killed", "train", *EVERYTHING, "backbone.pause=0.05")
     last = commands.folder / "killed" / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 100
     while not last.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.005)
     os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
+    out, err = process.communicate()
     assert process.returncode == -signal.SIGKILL
-    return last.parents[1]
+    return Ran(process.returncode, out, err, last.parents[1])
 
 
 def rows(ran_folder: Path) -> list[dict[str, str]]:
@@ -106,12 +106,11 @@ def test_the_console_ends_with_the_model_and_the_next_command(score):
 
 
 @pytest.mark.heavy
-def test_the_console_has_no_notes_and_advertisements(score, commands):
+def test_the_console_has_no_notes_and_advertisements(score, killed):
     assert score.err == ""
     assert "Tip" not in score.out
     assert "Tip" in (score.folder / "train.log").read_text()  # Lightning's notes are in the log
-    ran = commands.process("alone", "train", "trainer.max_epochs=1")  # where nobody has set up logging before
-    assert (ran.status, ran.err) == (0, "")
+    assert killed.err == ""  # in a process of its own nobody has set up logging before
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_gives_others(score, commands):
@@ -183,20 +182,15 @@ def test_the_papers_alternatives_train(commands, setting):
 
 @pytest.mark.heavy
 def test_resuming_after_kill_9_gives_the_weights_of_an_uninterrupted_run(commands, whole, killed):
-    begun = torch.load(killed / "checkpoints" / "last.ckpt", weights_only=True)
+    begun = killed.checkpoint()
     assert 1 <= begun["epoch"] + 1 < 6  # it was killed on the way
     resumed = commands.here("resumed", "train", "resume=killed")
     assert resumed.status == 0, resumed.err
-    end, wanted = (
-        torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True) for folder in (killed, whole.folder)
-    )
+    end, wanted = killed.checkpoint(), whole.checkpoint()
     assert end["epoch"] == wanted["epoch"] == 5
     for part in ("state_dict", "current_model_state", "optimizer_states", "lr_schedulers"):
         assert_equal(end[part], wanted[part], part)
-    best, wanted_best = (
-        torch.load(folder / "checkpoints" / "best.ckpt", weights_only=True) for folder in (killed, whole.folder)
-    )
-    assert_equal(best["state_dict"], wanted_best["state_dict"])
+    assert_equal(killed.checkpoint("best.ckpt")["state_dict"], whole.checkpoint("best.ckpt")["state_dict"])
 
 
 def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
@@ -294,24 +288,6 @@ def test_a_run_that_held_out_other_views_is_not_resumed(commands, score):
         "resume=earlier: was begun by an earlier version of lp_framework, which held out other views for validation; "
         "train anew"
     )
-
-
-@pytest.mark.parametrize(("key", "value"), [("loops", None), ("epoch", "three"), ("optimizer_states", {})])
-def test_a_checkpoint_without_its_training_is_not_resumed(commands, score, key, value):
-    folder = shutil.copytree(commands.folder / "score", commands.folder / f"without_{key}")
-    (folder / "checkpoints" / "best.ckpt").unlink()
-    file = folder / "checkpoints" / "last.ckpt"
-    torch.save({**torch.load(file, weights_only=True), key: value}, file)
-    ran = commands.here("onwards", "train", f"resume=without_{key}", "trainer.max_epochs=9")
-    missing = f"holds a model, but no training to go on with ('{key}' is missing or damaged)"
-    assert ran.error == f"without_{key}/checkpoints/last.ckpt: {missing}"
-
-
-def test_the_checkpoint_of_another_model_is_not_resumed(commands, score):
-    shutil.copytree(score.folder, commands.folder / "mixed")
-    ran = commands.here("energy", "train", "model=energy", "trainer.max_epochs=1")
-    shutil.copy(ran.folder / "checkpoints" / "last.ckpt", commands.folder / "mixed" / "checkpoints" / "last.ckpt")
-    assert "is of another model than this config's" in commands.here("wrong", "train", "resume=mixed").error
 
 
 # ---------------------------------------------------------------- two processes

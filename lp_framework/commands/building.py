@@ -90,7 +90,8 @@ class Components:
 
     def __getitem__(self, group: str) -> Any:
         if group not in self._built:
-            self._built[group] = self._trained_model() if self._is_trained(group) else self._build(group)
+            trained = group == "model" and group not in self.settings
+            self._built[group] = self._trained_model() if trained else self._build(group)
         return self._built[group]
 
     def needs(self, group: str) -> list[str]:
@@ -101,13 +102,10 @@ class Components:
         build = build_data if group == "data" else partial(registry.build, group)
         return build(self.settings[group], **{each: self[each] for each in self.needs(group)})
 
-    def _is_trained(self, group: str) -> bool:
-        return group == "model" and group not in self.settings
-
     def _trained_model(self) -> nn.Module:
         if self.checkpoint is None:
             self.checkpoint = find_checkpoint(self.settings["checkpoint"])
-        _say(f"model: {describe(self.checkpoint)}")
+        rank_zero_only(print)(f"model: {describe(self.checkpoint)}")
         return load_model(self.checkpoint)
 
 
@@ -118,11 +116,6 @@ def build_data(settings: Mapping[str, Any], **components: object) -> PairDataMod
     shared = {key: value for key, value in settings.items() if key in loader}
     source: ViewSource = registry.build("data", own, **components)
     return PairDataModule(source, **registry.checked(PairDataModule.__init__, shared, "data."))
-
-
-@rank_zero_only
-def _say(text: str) -> None:
-    print(text)
 
 
 def warn_of_unused(components: Components) -> None:
@@ -154,9 +147,6 @@ def build_trainer(
     settings: Mapping[str, Any], folder: Path, callbacks: list[Callback], logger: list[Logger]
 ) -> Trainer:
     """Lightning's trainer with `settings` as its arguments."""
-    epochs = settings.get("max_epochs", 1)
-    if not isinstance(epochs, int) or epochs < 0:
-        raise UserError(f"trainer.max_epochs must be a number of epochs, got {epochs}")
     arguments = registry.checked(Trainer.__init__, settings, "trainer.")
     try:
         return Trainer(

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import typing
 from pathlib import Path
 
 from omegaconf import DictConfig
 
-from lp_framework.errors import UserError, nearest
+from lp_framework import registry
+from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import FOLDER, find_checkpoint, read_checkpoint, write_model_folder
-from lp_framework.priors.zero123.networks import DTYPES, Dtype
-from lp_framework.priors.zero123.original import Averages
+from lp_framework.priors.zero123.networks import DTYPES
 from lp_framework.priors.zero123.weights import load_networks, write_folder
 
 
@@ -19,10 +18,7 @@ def run(config: DictConfig) -> None:
 
     Of a training run that holds a pose model, `checkpoint` takes it.
     """
-    for key, known in (("weights", typing.get_args(Averages)), ("dtype", typing.get_args(Dtype))):
-        if config[key] not in known:
-            choices = f"{nearest(str(config[key]), known)} (known: {', '.join(known)})"
-            raise UserError(f"{key}={config[key]} is none of its values{choices}")
+    registry.checked(load_networks, {"weights": config.weights, "dtype": config.dtype}, "")
     output = Path(config.output)
     if output.exists():
         raise UserError(f"output={output}: exists already; give another folder or remove it")

@@ -50,12 +50,6 @@ def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[
     Raises `UserError` where there is none, and for `overrides` of other settings.
     """
     if (folder / RESULT).is_file():
-        try:
-            json.loads((folder / RESULT).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise UserError(
-                f"{folder / RESULT}: is damaged ({error}), and nothing is left to go on from; evaluate anew"
-            ) from error
         raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
     subject = unfinished(folder)
     if subject is None:
@@ -63,9 +57,8 @@ def unfinished_evaluation(folder: Path, config: DictConfig, overrides: Sequence[
     previous = OmegaConf.create(subject["config"])
     if missing := sorted({*config} - {*previous}):
         raise UserError(f"resume={folder}: is of another version of lp_framework, without {missing[0]}; evaluate anew")
-    checkpoint = subject["checkpoint"]
-    saved = folder / FOLDER
-    return with_overrides(previous, config, overrides, MOVABLE, saved), None if checkpoint is None else Path(checkpoint)
+    checkpoint = Path(subject["checkpoint"]) if subject["checkpoint"] else None
+    return with_overrides(previous, config, overrides, MOVABLE, folder / FOLDER), checkpoint
 
 
 def with_overrides(

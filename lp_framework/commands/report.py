@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import typing
 from pathlib import Path
 
 from omegaconf import DictConfig, ListConfig
 from rich.console import Console
 from rich.text import Text
 
+from lp_framework import registry
 from lp_framework.commands.building import plain, run_folder, versions
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError
 from lp_framework.report.page import PAGE, write_report_page
 from lp_framework.report.printed_tables import terminal
 from lp_framework.report.runs import find_runs, run_folders
@@ -20,10 +20,7 @@ from lp_framework.report.sweeps import counted, draw_sweep, sweep_sections, writ
 
 def run(config: DictConfig) -> None:
     """Gather the runs and write `report.html` and, of evaluations, `report.md`, `.csv`, `.json` and figures."""
-    objects: Objects = config.objects
-    if objects not in (known := typing.get_args(Objects)):
-        said = f"objects={objects} is none of its values{nearest(str(objects), known)} (known: {', '.join(known)})"
-        raise UserError(said)
+    objects: Objects = registry.checked(sweep_tables, {"objects": config.objects}, "")["objects"]
     folders = [Path(str(each)) for each in (config.runs if isinstance(config.runs, ListConfig) else [config.runs])]
     found, left_out = find_runs(folders)
     finished = {each.folder for each in found}

@@ -6,7 +6,7 @@ import csv
 import math
 import shlex
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,42 +43,48 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
-from lp_framework.models.trained_module import RECIPE
 from lp_framework.report.page import write_run_page
 from lp_framework.viz.training import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
 OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, without use in eval
-# Of Lightning's entries in a checkpoint, those without which no training goes on.
-TRAINING_STATE = {"epoch": int, "global_step": int, "loops": dict, "optimizer_states": list, "lr_schedulers": list}
 
 
 @orderly_console()
 def run(config: DictConfig) -> None:
     """Train into this run's folder, or go on in the folder that `resume` names, or where this very run was stopped."""
-    folder = run_folder()
+    folder = run_folder() if config.resume is None else Path(config.resume)
+    saved = folder / "config.yaml"
+    begun = any((folder / FOLDER / name).is_file() for name in (LAST, BEST))
     last, checkpoint = None, None
     if config.resume is not None:
-        folder = Path(config.resume)
-        config = resumed_config(folder, config, HydraConfig.get().overrides.task)
+        if not saved.is_file() or not begun:
+            raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
+        before = _saved_config(saved, config)
+        if before.data.get("validation_views") and "validation_objects" not in before.data:
+            raise UserError(
+                f"resume={folder}: was begun by an earlier version of lp_framework, which held out other views for "
+                "validation; train anew"
+            )
+        # A run may be prolonged or moved to other devices.
+        config = with_overrides(before, config, HydraConfig.get().overrides.task, ("trainer",), saved)
+    elif begun and _saved_config(saved, config) != config:  # what was learned is not overwritten
+        raise UserError(
+            f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
+            "another hydra.run.dir"
+        )
+    _check(config)
+    if begun:
         last, checkpoint = last_checkpoint(folder)
-    elif _has_begun(folder):
-        _check_same(folder, config)
-        last, checkpoint = last_checkpoint(folder)
-        if is_finished(folder, config, checkpoint) and HydraConfig.get().mode == RunMode.MULTIRUN:
-            print(f"skipped, finished before: {folder}")
-            return
+        epochs = config.trainer.max_epochs
+        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and (folder / TRAINING).is_file():
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                print(f"skipped, finished before: {folder}")
+                return
+            raise UserError(
+                f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it"
+            )
     recipe = {"model": plain(config.model), "backbone": plain(config.backbone)}
-    if checkpoint is not None and checkpoint[RECIPE] != recipe:
-        raise UserError(f"{last}: is of another model than this config's; a resumed run keeps its model and backbone")
-    if checkpoint is not None and is_finished(folder, config, checkpoint):
-        raise UserError(f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it")
-    if config.trainer.max_epochs == 0:
-        raise UserError("trainer.max_epochs must be at least 1, got 0")
-    if config.ema is not None and not (isinstance(config.ema, int | float) and 0 <= config.ema <= 1):
-        raise UserError(f"ema must be a share from 0 to 1, or null for none; got {config.ema}")
-    if config.patience is not None and not (isinstance(config.patience, int) and config.patience >= 0):
-        raise UserError(f"patience must be a number of epochs, or null for no early stop; got {config.patience}")
     seed_run(config.seed)
     components = Components(plain(config))
     data, model = components["data"], components["model"]
@@ -87,42 +93,12 @@ def run(config: DictConfig) -> None:
         data.cache_features(extractor)
     trainer = build_trainer(plain(config.trainer), folder, callbacks(config, folder), loggers(config, folder))
     if trainer.is_global_zero:
-        write_text(folder / "config.yaml", OmegaConf.to_yaml(config))
+        write_text(saved, OmegaConf.to_yaml(config))
         if checkpoint is not None:
             keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
     trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
     if trainer.is_global_zero:
         report(trainer, folder, config, recipe, data)
-
-
-def resumed_config(folder: Path, config: DictConfig, overrides: Sequence[str]) -> DictConfig:
-    """The config of the run in `folder`, with what the command line (`overrides`) says of the trainer.
-
-    A run may be prolonged or moved to other devices; all else stays as it was, and `UserError` is raised for it.
-    """
-    saved = folder / "config.yaml"
-    if not saved.is_file() or not _has_begun(folder):
-        raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
-    before = _saved_config(saved, config)
-    if before.data.get("validation_views") and "validation_objects" not in before.data:
-        raise UserError(
-            f"resume={folder}: was begun by an earlier version of lp_framework, which held out other views for "
-            "validation; train anew"
-        )
-    return with_overrides(before, config, overrides, ("trainer",), saved)
-
-
-def _has_begun(folder: Path) -> bool:
-    return any((folder / FOLDER / name).is_file() for name in (LAST, BEST))
-
-
-def _check_same(folder: Path, config: DictConfig) -> None:
-    """`UserError` where the run in `folder` has another config than this one: what it learned is not overwritten."""
-    if _saved_config(folder / "config.yaml", config) != config:
-        raise UserError(
-            f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
-            "another hydra.run.dir"
-        )
 
 
 def _saved_config(file: Path, config: DictConfig) -> DictConfig:
@@ -136,31 +112,26 @@ def _saved_config(file: Path, config: DictConfig) -> DictConfig:
     return saved
 
 
+def _check(config: DictConfig) -> None:
+    epochs, ema, patience = config.trainer.max_epochs, config.ema, config.patience
+    if epochs == 0:
+        raise UserError("trainer.max_epochs must be at least 1, got 0")
+    if ema is not None and not (isinstance(ema, int | float) and 0 <= ema <= 1):
+        raise UserError(f"ema must be a share from 0 to 1, or null for none; got {ema}")
+    if patience is not None and not (isinstance(patience, int) and patience >= 0):
+        raise UserError(f"patience must be a number of epochs, or null for no early stop; got {patience}")
+
+
 def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
     """The last checkpoint of the run in `folder`, or its best where the last one was cut short by the run's end."""
     last, best = folder / FOLDER / LAST, folder / FOLDER / BEST
     try:
-        return last, _training_state(last)
+        return last, read_checkpoint(last)
     except UserError as error:
         if not best.is_file():
             raise
         warnings.warn(f"{error}; going on from {best}", stacklevel=2)
-        return best, _training_state(best)
-
-
-def _training_state(file: Path) -> dict[str, Any]:
-    """A checkpoint with what Lightning needs to go on, besides the weights."""
-    checkpoint = read_checkpoint(file)
-    for key, kind in TRAINING_STATE.items():
-        if not isinstance(checkpoint.get(key), kind):
-            raise UserError(f"{file}: holds a model, but no training to go on with ('{key}' is missing or damaged)")
-    return checkpoint
-
-
-def is_finished(folder: Path, config: DictConfig, checkpoint: Mapping[str, Any]) -> bool:
-    """Whether the run of a checkpoint has nothing left to do, its report included."""
-    epochs = config.trainer.max_epochs
-    return epochs is not None and 0 <= epochs <= checkpoint["epoch"] + 1 and (folder / TRAINING).is_file()
+        return best, read_checkpoint(best)
 
 
 def callbacks(config: DictConfig, folder: Path) -> list[Callback]:
@@ -173,15 +144,9 @@ def callbacks(config: DictConfig, folder: Path) -> list[Callback]:
         chosen.append(EarlyStopping("val/loss", patience=config.patience))
     # A callback each: with `save_last` the last epoch would be kept only where it is the best one, too.
     for file, monitor, mode in ((BEST, "val/loss" if validated else None, "min"), (LAST, "epoch", "max")):
+        named: dict[str, Any] = {"filename": Path(file).stem, "monitor": monitor, "mode": mode}
         chosen.append(
-            ModelCheckpoint(
-                folder / FOLDER,
-                monitor=monitor,
-                mode=mode,
-                filename=Path(file).stem,
-                enable_version_counter=False,
-                save_on_train_epoch_end=True,
-            )
+            ModelCheckpoint(folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True)
         )
     return chosen
 
@@ -198,7 +163,7 @@ def next_command(recipe: Mapping[str, Any], folder: str, data: Mapping[str, Any]
     """The command that uses the trained model, on the data that it was trained on."""
     if not issubclass(registry.get("model", recipe["model"]["name"]), PoseModel):
         return f"python -m lp_framework views prior.path={folder}"
-    usual = catalogue.values("data", data["name"]) if data["name"] in catalogue.choices("data") else {}
+    usual = catalogue.values("data", data["name"])
     changed = [
         f"data.{key}={shlex.quote(str(value))}"
         for key, value in data.items()
@@ -214,8 +179,8 @@ def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
         return
     with file.open(newline="") as content:
         reader = csv.DictReader(content)
-        columns = list(reader.fieldnames or ())
         rows = [list(row.values()) for row in reader if row["step"] and int(row["step"]) < steps]
+    columns = list(reader.fieldnames or ())
     writer = next(logger for logger in trainer.loggers if isinstance(logger, CSVLogger)).experiment
     write_csv(file, columns, rows)
     writer.metrics_keys = columns
