@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from PIL import Image
@@ -30,12 +30,7 @@ from lp_framework.commands.building import (
 )
 from lp_framework.commands.device import choose_device
 from lp_framework.data.camera_files import colmap_model, nerf_transforms
-from lp_framework.data.photographs import (
-    SIZE,
-    photograph_files,
-    prepared_photographs,
-    save_png,
-)
+from lp_framework.data.photographs import SIZE, photograph_files, prepared_photographs, save_png
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
@@ -53,28 +48,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class View:
-    """A photograph with its pose: `absolute` and `relative` to the first, `[3]` (radians, object sizes), float64."""
-
-    file: Path
-    image: str  # path of the prepared one in the run's folder
-    absolute: Tensor
-    relative: Tensor
-    energy: float  # of the pair with the first, NaN where the solver gives none
-
-    @property
-    def valid(self) -> bool:
-        """Whether the pose is one of a camera."""
-        return bool(self.absolute.isfinite().all() and self.absolute[2] > 0)
-
-    def row(self) -> list[object]:
-        """The values of `COLUMNS`."""
-        numbers = [*_in_degrees(self.absolute), *_in_degrees(self.relative)]
-        energy = "" if math.isnan(self.energy) else f"{self.energy:.6g}"
-        return [self.file, self.image, *(round(each, 4) for each in numbers), energy, self.valid]
-
-
 @orderly_console()
 def run(config: DictConfig) -> None:
     """Estimate and write `transforms.json`, `poses.csv`, `colmap/`, `images/`, `cameras.png` and `results.json`."""
@@ -84,7 +57,6 @@ def run(config: DictConfig) -> None:
     device = choose_device(config.accelerator)
     files = photograph_files(config.images)
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
-
     components = Components(plain(config))
     warn_of_unused(components)
     solver, starts = components["solver"], components["start"]
@@ -92,17 +64,11 @@ def run(config: DictConfig) -> None:
     view_sets = view_set(prepared, device)
     with shown_progress():
         solution = solver.solve_views(view_sets, starts.make(view_sets.with_first(), config.seed)[None], config.seed)
-
-    names = [f"images/{index:03d}.png" for index in range(len(files))]
     relative = torch.cat([torch.zeros(1, 3, dtype=torch.float64), solution.poses[0].detach().cpu().double()])
     absolute = apply_relative_pose(first, relative)
     energies = solution.energies[0].detach().cpu().double()
-    estimated = [View(*each) for each in zip(files, names, absolute, relative, energies[0].tolist(), strict=True)]
     if not solution.valid[0]:
         log.warning("the solver did not come to a sound pose for every image")
-    for view in estimated:
-        if not view.valid:
-            log.warning("%s: the solver found no pose; it is left out of the camera files", view.file)
     result = {
         "seconds": solution.cost.seconds,
         "network_passes": solution.cost.network_passes,
@@ -113,8 +79,9 @@ def run(config: DictConfig) -> None:
         "config": plain(config),
         "versions": versions(),
     }
-    _write(folder, estimated, prepared, result)
-    _print(folder, estimated)
+    write_json(folder / "results.json", result)
+    rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist())
+    _print(folder, rows)
     warn_of_prior(components)
 
 
@@ -132,55 +99,53 @@ def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
     return torch.tensor([math.radians(latitude_degrees), 0.0, radius], dtype=torch.float64)
 
 
-def _texts(pose: Tensor) -> list[str]:
-    latitude, longitude, radius = _in_degrees(pose)
-    rounded = round(latitude, 1), round(longitude, 1), round(radius, 2)
-    latitude, longitude, radius = (each + 0.0 for each in rounded)  # no minus zero
-    return [f"{latitude:.1f}°", f"{longitude:.1f}°", f"{radius:.2f}"]
-
-
-def _in_degrees(pose: Tensor) -> tuple[float, float, float]:
-    latitude, longitude, radius = pose.tolist()
-    return math.degrees(latitude), math.degrees(longitude), radius
-
-
-def _write(folder: Path, views: Sequence[View], prepared: Sequence[Image.Image], result: dict[str, Any]) -> None:
+def _write(
+    folder: Path, files: Sequence[Path], prepared: Sequence[Image.Image], poses: Tensor, energies: Sequence[float]
+) -> list[list[Any]]:
+    """The images and their cameras, of absolute and relative poses `[I, 6]`; returns the rows of `poses.csv`."""
+    images = [f"images/{index:03d}.png" for index in range(len(files))]
     (folder / "images").mkdir(exist_ok=True)
-    for view, image in zip(views, prepared, strict=True):
-        save_png(folder / view.image, image)
-    numbers = [number for number, view in enumerate(views) if view.valid]
-    poses = torch.stack([views[number].absolute for number in numbers])
-    files = [views[number].image for number in numbers]
-    write_json(folder / "transforms.json", nerf_transforms(files, poses, FIELD_OF_VIEW_DEGREES))
+    for image, picture in zip(images, prepared, strict=True):
+        save_png(folder / image, picture)
+    valid = (poses.isfinite().all(dim=1) & (poses[:, 2] > 0)).tolist()
+    for file, is_pose in zip(files, valid, strict=True):
+        if not is_pose:
+            log.warning("%s: the solver found no pose; it is left out of the camera files", file)
+    numbers = poses.numpy().copy()
+    numbers[:, [0, 1, 3, 4]] = np.degrees(numbers[:, [0, 1, 3, 4]])
+    rows = [
+        [file, image, *(round(number, 4) for number in row), "" if math.isnan(energy) else f"{energy:.6g}", is_pose]
+        for file, image, row, energy, is_pose in zip(files, images, numbers.tolist(), energies, valid, strict=True)
+    ]
+    write_csv(folder / "poses.csv", COLUMNS, rows)
+    found = [index for index, is_pose in enumerate(valid) if is_pose]
+    cameras, names = poses[found, :3], [Path(images[index]).name for index in found]
+    transforms = nerf_transforms([images[index] for index in found], cameras, FIELD_OF_VIEW_DEGREES)
+    write_json(folder / "transforms.json", transforms)
     (folder / "colmap").mkdir(exist_ok=True)
-    names = [Path(file).name for file in files]
-    for name, text in colmap_model(names, poses, SIZE, FIELD_OF_VIEW_DEGREES).items():
+    for name, text in colmap_model(names, cameras, SIZE, FIELD_OF_VIEW_DEGREES).items():
         write_text(folder / "colmap" / name, text)
-    write_csv(folder / "poses.csv", COLUMNS, [view.row() for view in views])
-    write_json(folder / "results.json", result)
-    images = [prepared[number] for number in numbers]
-    titles = [views[number].file.name for number in numbers]
-    save_figure(cameras_figure(poses.numpy(), images, numbers, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
+    pictures, titles = [prepared[index] for index in found], [files[index].name for index in found]
+    save_figure(cameras_figure(cameras.numpy(), pictures, found, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
+    return rows
 
 
-def _print(folder: Path, views: Sequence[View]) -> None:
+def _print(folder: Path, rows: Sequence[Sequence[Any]]) -> None:
+    """The rows of `poses.csv` for people, and where everything is."""
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("", no_wrap=True)
     for column in ("latitude", "longitude", "radius", "relative: latitude", "longitude", "radius", "energy"):
         table.add_column(column, justify="right")
-    for index, view in enumerate(views):
-        absolute, relative = _texts(view.absolute), _texts(view.relative)
+    forms = ("{:.1f}°", "{:.1f}°", "{:.2f}") * 2
+    for index, (file, _, *numbers, energy, is_pose) in enumerate(rows):
+        texts = [form.format(number) for form, number in zip(forms, numbers, strict=True)]
         if index == 0:
-            table.add_row(view.file.name, *absolute, "reference")
-        elif view.valid:
-            energy = "" if math.isnan(view.energy) else f"{view.energy:.4g}"
-            table.add_row(view.file.name, *absolute, *relative, energy)
-        else:
-            table.add_row(view.file.name, "none")
+            texts[3:] = ["reference"]
+        table.add_row(file.name, *([*texts, energy] if is_pose else ["none"]))
     console.print(table)
-    for what, path in (
-        ("poses", "transforms.json, poses.csv"), ("COLMAP", "colmap"), ("images", "images"), ("picture", "cameras.png"),
-    ):  # fmt: skip
-        console.print(f"{what + ':':9}{folder}/{path}", soft_wrap=True)
+    console.print(f"poses:   {folder}/transforms.json, poses.csv", soft_wrap=True)
+    console.print(f"COLMAP:  {folder}/colmap", soft_wrap=True)
+    console.print(f"images:  {folder}/images", soft_wrap=True)
+    console.print(f"picture: {folder}/cameras.png", soft_wrap=True)
     console.print(f"page:    {write_run_page(folder, 'estimate')}", soft_wrap=True)

@@ -60,8 +60,7 @@ def run(config: DictConfig) -> None:
         raise UserError(f"pictures must be true or false, got {settings['pictures']}")
     seed_run(settings["seed"])
     components = Components(settings, checkpoint)
-    takes_model = "model" in components.needs("solver")
-    if takes_model and checkpoint is None:
+    if "model" in components.needs("solver") and checkpoint is None:
         components.checkpoint = find_checkpoint(settings["checkpoint"])
     if settings["resume"] is None and is_finished(folder, settings, components.checkpoint):
         return
