@@ -12,6 +12,7 @@ Beside what every `transform.json` has, a frame keeps its photograph (`source`, 
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from abc import abstractmethod
 from collections import Counter
@@ -218,11 +219,10 @@ class PhotographedData(ConvertedSource):
 
     def _frame(self, file: str, view: SphericalView) -> dict[str, Any]:
         photograph, radius = view.photograph, view.radius
-        source = photograph.file
         angle = crop_field_of_view(photograph.camera[:3, 3].norm(), radius)
         return {
             **frame(file, spherical_camera(photograph.camera, radius)),
-            "source": str(source.relative_to(self.download) if source.is_relative_to(self.download) else source),
+            "source": os.path.relpath(photograph.file, self.download),
             "width": photograph.size[0],
             "height": photograph.size[1],
             "photograph_camera": photograph.camera.tolist(),

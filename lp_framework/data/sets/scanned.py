@@ -7,6 +7,7 @@ seeded. It is written to `objects.json` beside the views and read from there aft
 
 from __future__ import annotations
 
+import io
 from abc import abstractmethod
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import trimesh
-from trimesh.resolvers import FilePathResolver
+from trimesh.resolvers import ZipResolver
 
 from lp_framework.data.meshes import MeshObject, load_scene, normalise
 from lp_framework.data.reading import expecting, names_below
@@ -77,20 +78,6 @@ class ScannedData(MeshData):
         return MeshObject(name, "unlabelled", partial(self.load, self.file(name)))
 
 
-class _GSOFiles(FilePathResolver):
-    """Finds what lies beside the mesh, and the texture where GSO has it; its material names it without the folder."""
-
-    def __init__(self, mesh: Path, texture: Path) -> None:
-        super().__init__(str(mesh))
-        self.texture = texture
-
-    def get(self, name: str) -> bytes:
-        if Path(name).name == self.texture.name:
-            return self.texture.read_bytes()
-        content: bytes = super().get(name)
-        return content
-
-
 def load_gso(path: Path) -> trimesh.Scene:
     """The normalised scene of an object of GSO, turned from +Z up to +Y up.
 
@@ -101,7 +88,9 @@ def load_gso(path: Path) -> trimesh.Scene:
         if not file.is_file():
             raise UserError(f"{file}: there is no such file; an object of GSO needs it")
     with expecting(f"{path}: does not load as a mesh"), path.open("rb") as opened:
-        scene = trimesh.load_scene(opened, file_type="obj", resolver=_GSOFiles(path, texture))
+        # The material names its texture without the folder.
+        files = {file.name: io.BytesIO(file.read_bytes()) for file in (*path.parent.glob("*.mtl"), texture)}
+        scene = trimesh.load_scene(opened, file_type="obj", resolver=ZipResolver(files))
         scene.apply_transform(_Z_UP_TO_Y_UP)
         return normalise(scene)
 
