@@ -20,7 +20,7 @@ from lp_framework.data.procedural import solids as shapes
 from lp_framework.data.toy import toy_objects
 
 TOYS = {toy.name: toy for toy in toy_objects()}
-SPACING = 0.012  # between neighbouring points of a cloud, in units of the object's longest side
+SPACING = 0.015  # between neighbouring points of a cloud, in units of the object's longest side
 SAME, DIFFERENT = 0.6 * SPACING, 1.25 * SPACING  # Chamfer distances; two clouds of one surface are 0.5 * SPACING apart
 
 
