@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import check_settings
@@ -18,7 +18,7 @@ from lp_framework.models.networks import PoseNetwork
 from lp_framework.models.objectives import NoisedPose, PoseKernel
 from lp_framework.models.pair_mean import PairMean
 from lp_framework.models.trained_module import TrainedModule
-from lp_framework.models.view_head import ViewHead
+from lp_framework.models.view_head import relative_pose_loss
 from lp_framework.registry import register
 
 VALIDATION_NOISES = 4  # noised poses a validation pair
@@ -79,7 +79,8 @@ class PoseModel(TrainedModule):
         self.network = PoseNetwork(
             backbone.feature_dim, self.outputs, hidden, layers, frequencies, self.kernel.periodic, dropout
         )
-        self.view_head = ViewHead(backbone.feature_dim) if view_loss > 0 else None
+        # The linear readout of `relative_pose_loss`, by the name that it has in checkpoints.
+        self.view_head = nn.ModuleDict({"readout": nn.Linear(backbone.feature_dim, 4)} if view_loss > 0 else {})
         self.view_loss = view_loss
         self.validation_loss = PairMean()
 
@@ -110,8 +111,8 @@ class PoseModel(TrainedModule):
         condition = self.condition(features[batch.reference], features[batch.query])
         loss = self.pair_loss(condition, noised, true).mean()
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
-        if self.view_head is not None:
-            view_loss = self.view_head.loss(features, batch)
+        if self.view_loss > 0:
+            view_loss = relative_pose_loss(self.view_head["readout"](features), batch)
             self.log("train/view_loss", view_loss, prog_bar=True, batch_size=len(batch))
             loss = loss + self.view_loss * view_loss
         return loss

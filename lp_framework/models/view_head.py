@@ -10,7 +10,7 @@ starts is left to the network, so no object gets a parameter of its own. `model.
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lp_framework.data.pairs import PairBatch
 
@@ -36,15 +36,3 @@ def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
     error = difference - scaled(true)
     longitude = torch.view_as_real(turn - torch.polar(torch.ones_like(true[:, 1]), true[:, 1]))
     return longitude.square().sum(dim=-1).mean() + error.square().mean()
-
-
-class ViewHead(nn.Module):
-    """The linear readout of features `[I, D]`, and its loss."""
-
-    def __init__(self, feature_dim: int) -> None:
-        super().__init__()
-        self.readout = nn.Linear(feature_dim, 4)
-
-    def loss(self, features: Tensor, batch: PairBatch) -> Tensor:
-        """See `relative_pose_loss`."""
-        return relative_pose_loss(self.readout(features), batch)
