@@ -78,8 +78,9 @@ class IDPose(Solver):
             ("refinement_rate", refinement_rate, refinement_rate > 0, "positive"),
             ("averaged", averaged, averaged >= 1, "at least 1"),
         )
-        self.prior, self.candidates, self.longitudes = prior, candidates, longitudes
-        self.latitudes = [math.radians(each) for each in latitudes_degrees]
+        self.prior, self.candidates = prior, candidates
+        around = [2 * math.pi * number / longitudes for number in range(longitudes)]
+        self.grid = [(math.radians(each), longitude, 0.0) for longitude in around for each in latitudes_degrees]
         self.timestep = int(timestep * prior.num_timesteps)
         shares = [timestep + timestep_span * number / probes for number in range(probes)]
         self.probe_timesteps = [int(share * prior.num_timesteps) for share in shares]
@@ -153,11 +154,8 @@ class IDPose(Solver):
     def explore(self, energy: PairEnergy, starts: Tensor) -> tuple[Tensor, Tensor]:
         """The trajectories `[B, K, steps, 3]` of the K best candidates, best first, and their probed energies `[B, K]`
         (NaN where the prior failed): the better half of all is led a little downhill and probed again."""
-        poses = starts.clone()
-        if self.candidates == "grid":
-            longitudes = [2 * math.pi * number / self.longitudes for number in range(self.longitudes)]
-            grid = [(latitude, longitude, 0.0) for longitude in longitudes for latitude in self.latitudes]
-            poses = starts.new_tensor(grid).repeat(len(starts), 1, 1)
+        given = self.candidates == "starts"
+        poses = starts.clone() if given else starts.new_tensor(self.grid).repeat(len(starts), 1, 1)
         noise = energy.noise(self.exploration_steps, len(self.probe_timesteps))
         probed = energy.mean(poses, self.probe_timesteps, noise)
         poses = _take(poses, _order(probed)[:, : max(1, poses.shape[1] // 2)])
