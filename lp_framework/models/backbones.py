@@ -109,6 +109,11 @@ class Standardise(nn.Module):
         self.count.copy_(count)
 
 
+def freeze(module: nn.Module) -> None:
+    """Fix a module's weights."""
+    module.eval().requires_grad_(False)
+
+
 @register("backbone", "efficientnet_lite0")
 class EfficientNetLite0(Backbone):
     """EfficientNet-Lite0 with ImageNet weights that come as a Python package: works offline, frozen, cached.
@@ -129,7 +134,7 @@ class EfficientNetLite0(Backbone):
         network.load_state_dict(weights)
         stride_32 = next(i for i, block in enumerate(network._blocks) if block._project_conv.out_channels == 192)
         self.stem = nn.Sequential(network._conv_stem, network._bn0, nn.ReLU6(), *network._blocks[:stride_32])
-        self.stem.eval().requires_grad_(False)
+        freeze(self.stem)
         channels = network._blocks[stride_32 - 1]._project_conv.out_channels
         self.trunk_dim = channels * 16
         self.head = nn.Sequential(
@@ -179,7 +184,7 @@ class ResNet(Backbone):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         if frozen:
-            self.resnet.eval().requires_grad_(False)
+            freeze(self.resnet)
 
     def _load_imagenet(self, arch: str) -> None:
         from torchvision.models import get_model_weights
