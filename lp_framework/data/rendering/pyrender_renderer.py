@@ -98,9 +98,6 @@ def _shared_corners(corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], 
     return corners[first], index
 
 
-# ---------------------------------------------------------------- the context
-
-
 @cache
 def offscreen_context() -> pyrender.OffscreenRenderer:
     """The process's one OpenGL context; `UserError` where there is none to be had.

@@ -87,13 +87,9 @@ class PriorModel(TrainedModule):
         alone = [data[part[:, None].expand(-1, 2).numpy()] for part in views.split(256)]  # pairs of a view with itself
         self.networks.latents.fit(torch.cat([self._pixels(batch) for batch in alone]).to(self.device))
 
-    # ------------------------------------------------------------ use
-
     def code(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Latents `[I, latent_dim]` and codes `[I, code_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
         return self.networks.latents(shrink(images)), self.networks.encoder(self.backbone(images))
-
-    # ------------------------------------------------------------ training
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
         pixels = self._pixels(batch)

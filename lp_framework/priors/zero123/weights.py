@@ -84,9 +84,6 @@ def _needed(names: list[str]) -> list[str]:
     return needed
 
 
-# ---------------------------------------------------------------- folders
-
-
 def read_folder(path: Path) -> tuple[Configs, Weights]:
     """Sizes and tensors of the four networks of a folder; `UserError` where a file is missing or cannot be read."""
     projection = next((path / name for name in PROJECTIONS if (path / name).is_dir()), None)
