@@ -24,9 +24,7 @@ class Light(NamedTuple):
     intensity: float
 
 
-KEY = Light((-0.6, 0.8, 1.1), 2.5)  # upper left, behind the camera
-FILL = Light((1.0, 0.1, 0.7), 0.65)  # right
-LIGHTS = (KEY, FILL)
+LIGHTS = Light((-0.6, 0.8, 1.1), 2.5), Light((1.0, 0.1, 0.7), 0.65)  # from the upper left behind; from the right
 AMBIENT = 0.2
 
 

@@ -82,11 +82,10 @@ class Zero123Prior(Prior):
         self.image_size, self.latent_shape = IMAGE_SIZE, (int(self.vae.config.latent_channels), side, side)
         self.channels_last, self.cuda_graph, self.replayed = channels_last, cuda_graph, Replayed()
         self.chunks, self.image_chunks = (Chunks(max_batch, self.replayed.forget) for _ in range(2))
-        alphas = scaled_linear_alphas()
-        self.num_timesteps = len(alphas)
-        self.register_buffer("alphas_cumprod", alphas, persistent=False)
+        self.register_buffer("alphas_cumprod", scaled_linear_alphas(), persistent=False)
         self.register_buffer("clip_mean", torch.tensor(CLIP_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("clip_std", torch.tensor(CLIP_STD).view(3, 1, 1), persistent=False)
+        self.num_timesteps = len(self.alphas_cumprod)
 
     def _apply(self, function: Any, recurse: bool = True) -> Any:
         """Whatever moves or converts a module passes here."""
