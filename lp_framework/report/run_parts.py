@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from lp_framework.analysis.examples import EXAMPLES, read_examples
-from lp_framework.analysis.shown import ShownPair, words
+from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import RESULT, summary_rows
 from lp_framework.report.parts import About, Record, RunPart, Sections, packed, read_rows, run_part, tried
@@ -72,30 +72,22 @@ def _about_evaluation(result: Record) -> About:
     )
 
 
-class Pair(NamedTuple):
-    """A pair with its plots (packed, by kind), and the steps that their frames show."""
-
-    example: ShownPair
-    plots: Mapping[str, str]
-    steps: Sequence[int]
-
-
 def _pairs(folder: Path, record: Record) -> dict[str, Any]:
-    """The pairs that a run keeps beside its pictures, a card each."""
+    """The pairs that a run keeps beside its pictures, each with its plots (packed, by kind) and the steps they show."""
     if record.get("config", {}).get("pictures") is False:
         raise UserError("the run was made with pictures=false")
     examples = read_examples(folder / "pictures" / EXAMPLES)
-    shown: list[Pair] = []
-    size = 0
+    shown: list[dict[str, Any]] = []
+    room = LARGEST
     for example in examples:
         kinds = {"map": map_plot, "cameras": pair_cameras_plot}
         if example.landscapes:
             kinds["surface"] = surface_plot
         plots = {kind: packed(draw(example).to_json()) for kind, draw in kinds.items()}
-        size += sum(map(len, plots.values()))
-        if shown and size > LARGEST:
+        room -= sum(map(len, plots.values()))
+        if shown and room < 0:
             break
-        shown.append(Pair(example, plots, frame_steps(example)))
+        shown.append({"example": example, "plots": plots, "steps": frame_steps(example)})
     return {"pairs": shown, "left_out": len(examples) - len(shown)}
 
 
@@ -123,7 +115,10 @@ def _errors(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
 
 def training_part(folder: Path) -> RunPart:
     """Of the folder of a `train`, which may not have finished."""
-    sections = [("Losses", "losses", lambda _: _losses(folder)), ("Last values", "last", _last)]
+    sections = [
+        ("Losses", "losses", lambda _: _losses(folder)),
+        ("Last values", "last", lambda report: {"final": report["final"]}),
+    ]
     return run_part(folder, "training.json", partial(_about_training, folder), sections)
 
 
@@ -145,13 +140,6 @@ def _losses(folder: Path) -> dict[str, Any]:
     if not losses:
         raise UserError("no loss was logged")
     return {"figure": losses_plot(losses, rate)}
-
-
-def _last(report: Record) -> dict[str, Any]:
-    if "final" not in report:
-        raise UserError("the run is not finished")
-    values = sorted(report["final"].items())
-    return {"values": {name: "none" if value is None else f"{value:.5g}" for name, value in values}}
 
 
 # ---------------------------------------------------------------- estimate
