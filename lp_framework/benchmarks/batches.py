@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lp_framework.benchmarks.harness import Section, Work, worth
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.pairs import BlockSampler, PairBatch, PairData
+from lp_framework.data.pairs import BlockSampler, PairBatch
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 
@@ -22,7 +22,7 @@ ENCODING = "encoding: the images of pairs", ("each view once", "two images a pai
 
 def measure_loading(section: Section, data: PairDataModule, new_model: PoseModel, rounds: int, steps: int) -> None:
     """Training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
-    optimizer = _still(new_model.parameters())
+    optimizer = torch.optim.Adam(new_model.parameters(), lr=0.0)  # the weights stay, so every step does the same work
 
     def training(batches: Iterator[PairBatch]) -> Work:
         def work() -> float:
@@ -37,7 +37,7 @@ def measure_loading(section: Section, data: PairDataModule, new_model: PoseModel
 
         return work
 
-    loaders = feature_space(data), plain_pairs(data.data("train"), data.batch_pairs)
+    loaders = feature_space(data), plain_pairs(data)
     section.note = _told(data, new_model)
     kept = [kept_for_backward(new_model, next(batches).to(section.device)) for batches in loaders]  # and a warm-up
     section.add("memory for backward, kB a pair", kept[0] / 1024, kept[1] / 1024)
@@ -51,8 +51,8 @@ def measure_encoding(section: Section, data: PairDataModule, new_model: PoseMode
     The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
     against features of both images of every pair at every step. Batches are drawn beforehand.
     """
-    once, plain = next(feature_space(data)), next(plain_pairs(data.data("train"), data.batch_pairs))
-    optimizer = _still([*new_model.backbone.head.parameters(), *new_model.network.parameters()])
+    once, plain = next(feature_space(data)), next(plain_pairs(data))
+    optimizer = torch.optim.Adam([*new_model.backbone.head.parameters(), *new_model.network.parameters()], lr=0.0)
 
     @torch.no_grad()
     def encode(encoder: Callable[[Tensor], object], batch: PairBatch) -> None:
@@ -63,8 +63,8 @@ def measure_encoding(section: Section, data: PairDataModule, new_model: PoseMode
         loss_on(new_model, batch.to(section.device), new_model.backbone.head(trunk())).backward()
         optimizer.step()
 
-    def both(do: Callable[..., None], *arguments: object) -> tuple[Work, Work]:
-        first, second = (worth(len(batch), partial(do, *arguments, batch)) for batch in (once, plain))
+    def encoding(encoder: Callable[[Tensor], object]) -> tuple[Work, Work]:
+        first, second = (worth(len(batch), partial(encode, encoder, batch)) for batch in (once, plain))
         return first, second
 
     def features(batch: PairBatch) -> Tensor:
@@ -74,8 +74,8 @@ def measure_encoding(section: Section, data: PairDataModule, new_model: PoseMode
     section.note = _told(data, new_model)
     section.race(
         {
-            "pairs a second, backbone": both(encode, new_model.encode),
-            "pairs a second, prior": both(encode, prior.encode),
+            "pairs a second, backbone": encoding(new_model.encode),
+            "pairs a second, prior": encoding(prior.encode),
             "pairs a second, training on a frozen backbone": (
                 worth(len(once), lambda: train(once, lambda: kept)),
                 worth(len(plain), lambda: train(plain, lambda: features(plain))),
@@ -84,11 +84,6 @@ def measure_encoding(section: Section, data: PairDataModule, new_model: PoseMode
         rounds,
         rate=True,
     )
-
-
-def _still(parameters: object) -> torch.optim.Optimizer:
-    """An optimiser under which the weights stay, so that every step does the same work."""
-    return torch.optim.Adam(parameters, lr=0.0)  # type: ignore[arg-type]
 
 
 def _told(data: PairDataModule, model: PoseModel) -> str:
@@ -104,12 +99,12 @@ def feature_space(data: PairDataModule) -> Iterator[PairBatch]:
             yield views[pairs]
 
 
-def plain_pairs(data: PairData, batch_pairs: int) -> Iterator[PairBatch]:
+def plain_pairs(data: PairDataModule) -> Iterator[PairBatch]:
     """Pairs drawn at random, two images a pair, as a data set of image pairs gives them."""
-    everything = data.table.pairs()
-    random = np.random.default_rng(0)
+    views, random = data.data("train"), np.random.default_rng(0)
+    everything = views.table.pairs()
     while True:
-        yield two_images_a_pair(data[everything[random.choice(len(everything), batch_pairs, replace=False)]])
+        yield two_images_a_pair(views[everything[random.choice(len(everything), data.batch_pairs, replace=False)]])
 
 
 def two_images_a_pair(batch: PairBatch) -> PairBatch:

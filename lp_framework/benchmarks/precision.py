@@ -51,9 +51,9 @@ def measure(
     codes = prior.encode(pair.images)
     ready = encoded(prior, codes)
     operations = starts * arithmetic_of(plain, device)[BATCHED].operations
+    memory = held_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
         exact = gradient(ready, pair, poses)
-    memory = held_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
     section.note = (
         f"Zero123's {architecture} size, random weights, {starts} starts, a step is {operations / 1e9:.3g} GFLOP"
     )
