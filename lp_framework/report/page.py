@@ -13,7 +13,7 @@ from typing import NamedTuple
 from plotly.offline import get_plotlyjs
 
 from lp_framework.evaluation.tables import write_text
-from lp_framework.report.parts import RunPart, Section, packed, render
+from lp_framework.report.parts import RunPart, Section, packed_text, render
 from lp_framework.report.run_parts import PARTS
 from lp_framework.report.runs import Kind
 
@@ -82,4 +82,4 @@ def _several(runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> Run
 @cache
 def _plotly() -> str:
     """plotly.js, packed: a third of its size, so that every run of a sweep can have a page."""
-    return packed(get_plotlyjs())
+    return packed_text(get_plotlyjs())

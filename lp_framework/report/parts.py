@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import plotly.graph_objects as go
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from numpy.typing import NDArray
@@ -110,7 +111,12 @@ def _read(file: Path, parse: Callable[[str], T]) -> T:
         raise UserError(f"{file.name} is damaged ({error})") from error
 
 
-def packed(text: str) -> str:
+def packed(figure: go.Figure) -> str:
+    """A figure for the page's script, compressed, in letters."""
+    return packed_text(figure.to_json())
+
+
+def packed_text(text: str) -> str:
     """Text for the page's script, compressed, in letters."""
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
@@ -137,16 +143,6 @@ def metric(metrics: Mapping[str, float | None], key: str) -> str:
     return number(key, math.inf if value is None else value)
 
 
-def minus(text: str) -> str:
-    """Numbers in print with a minus sign where they have a hyphen."""
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
-def angle(radians: float) -> str:
-    """An angle in print."""
-    return minus(f"{math.degrees(radians):.1f}°")
-
-
 _ENVIRONMENT = Environment(
     loader=PackageLoader("lp_framework.report"),
     autoescape=lambda name: not str(name).endswith(".md.j2"),
@@ -154,14 +150,11 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {
-    **{"metric": metric, "picture": picture, "sheet": sheet, "words": words, "minus": minus, "angle": angle},
-    "packed": lambda figure: packed(figure.to_json()),
-}
+_ENVIRONMENT.filters |= {"metric": metric, "picture": picture, "sheet": sheet, "words": words, "packed": packed}
 _ENVIRONMENT.tests |= {"finite": math.isfinite}
 _ENVIRONMENT.globals |= {
     "classes": list(CLASS_COLOURS),
     "failure": ROTATION_THRESHOLDS[-1],
     "metrics": {key: HEADINGS.get(key, key) for key in (*COLUMNS, *ERRORS)},
-    "turn": 2 * math.pi,
+    "pi": math.pi,
 }

@@ -83,7 +83,7 @@ def _pairs(folder: Path, record: Record) -> dict[str, Any]:
         kinds = {"map": map_plot, "cameras": pair_cameras_plot}
         if example.landscapes:
             kinds["surface"] = surface_plot
-        plots = {kind: packed(draw(example).to_json()) for kind, draw in kinds.items()}
+        plots = {kind: packed(draw(example)) for kind, draw in kinds.items()}
         room -= sum(map(len, plots.values()))
         if shown and room < 0:
             break

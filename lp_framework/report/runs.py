@@ -162,7 +162,9 @@ def saved_config(file: Path) -> dict[str, Any]:
 def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
     """A name for every value of the setting `checkpoint`: the model's where that tells them apart, else the path."""
     paths = {run.settings["checkpoint"]: run.checkpoint for run in runs if run.checkpoint is not None}
-    models = {value: _model_name(value) or path for value, path in paths.items()}
+    models = {
+        value: path if value == path else json.loads(value).get("model.name", path) for value, path in paths.items()
+    }
     return models if len(set(models.values())) == len(models) else paths
 
 
@@ -184,10 +186,3 @@ def _number(value: Any) -> Any:
     if isinstance(value, list):
         return [_number(each) for each in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def _model_name(checkpoint: str) -> str | None:
-    try:
-        return str(json.loads(checkpoint)["model.name"])
-    except (ValueError, KeyError, TypeError):  # a path
-        return None
