@@ -14,10 +14,10 @@ import pytest
 from result_folders import metrics, write_job, write_result
 
 from lp_framework.errors import UserError
-from lp_framework.report.printed_tables import csv_rows, layout
 from lp_framework.report.runs import checkpoint_setting, find_runs, read_run
 from lp_framework.report.sweep_figures import sweep_figure
 from lp_framework.report.sweep_tables import sweep_tables, varying
+from lp_framework.report.sweeps import csv_rows, layout
 from lp_framework.viz.sweeps import Curve, Panel, curves_figure
 
 RECALLS = {0: (0.80, 0.82, 0.90), 0.3: (0.90, 0.91, 0.95)}  # by gamma, of seeds 0, 1, 2

@@ -23,12 +23,12 @@ from lp_framework.analysis.shown import words
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS
-from lp_framework.report.printed_tables import HEADINGS, number
-from lp_framework.report.runs import saved_config
+from lp_framework.report.runs import COSTS, saved_config
 from lp_framework.viz.style import CLASS_COLOURS
 
 # What a damaged file leads to; `UserError` is a `ValueError`.
 BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, UndefinedError)
+HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passes"], strict=True))
 T = TypeVar("T")
 Record = Mapping[str, Any]
 About = tuple[str, str, Mapping[str, str]]  # title, subtitle, and the most important numbers by name
@@ -133,6 +133,19 @@ def picture(image: NDArray, side: int) -> str:
 def sheet(file: Path) -> str:
     """A printed figure (PNG file) as an address that holds it."""
     return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
+
+
+def number(name: str, value: float) -> str:
+    """A metric's value, rounded as is usual for it."""
+    if not math.isfinite(value):
+        return "inf"
+    if name == "network_passes_per_pair":
+        return f"{value:.0f}"
+    if name == "rotation_error":
+        return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+    if name == "seconds_per_pair":
+        return f"{value:.3g}"
+    return f"{value:.3f}"
 
 
 def metric(metrics: Mapping[str, float | None], key: str) -> str:

@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
-from lp_framework.report.printed_tables import heading, shown
-from lp_framework.report.sweep_tables import Row, Spread, SweepTable
+from lp_framework.report.sweep_tables import Row, Spread, SweepTable, heading, shown
 from lp_framework.viz.sweeps import COLOURS, Curve, Entry, Panel, curves_figure, entries_figure
 
 AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins

@@ -136,6 +136,22 @@ def in_order(value: Any) -> tuple[int, float, str]:
     return (0, 0.0, "") if value is None else (2, 0.0, str(value))
 
 
+def heading(key: str) -> str:
+    """A setting as a heading, as it is written on the command line.
+
+    >>> heading("solver.name"), heading("solver.gamma")
+    ('solver', 'solver.gamma')
+    """
+    return key.removesuffix(".name")
+
+
+def shown(value: Any) -> str:
+    """A setting's value in a table."""
+    if value is None:
+        return "-"
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def _table(runs: Sequence[Run], experiment: str | None, objects: Objects) -> SweepTable:
     names = checkpoint_names(runs)
     groups: dict[str, list[Run]] = {}
