@@ -18,10 +18,10 @@ from lp_framework import registry
 from lp_framework.benchmarks import batches, counting, harness, precision, rendering, second_stage, zero123
 from lp_framework.benchmarks.adam_gauss_newton import followed, some_pairs
 from lp_framework.benchmarks.batches import loss_on, trunk_features
+from lp_framework.benchmarks.checkpoint import original_tensors
 from lp_framework.benchmarks.counting import counted, launched, peak_bytes
 from lp_framework.benchmarks.first_stage import all_pairs, plain_loop
 from lp_framework.benchmarks.harness import Section
-from lp_framework.benchmarks.original_layout import original_tensors
 from lp_framework.benchmarks.precision import variant
 from lp_framework.benchmarks.scaling import exponent
 from lp_framework.benchmarks.second_stage import BATCHED, LOOP, Arithmetic, arithmetic_of
