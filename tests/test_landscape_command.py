@@ -160,7 +160,10 @@ def test_the_overview_has_an_ambiguity_for_every_object(commands):
         (["object=tram", "query=1", "timesteps=[1000]"], "this prior has timesteps 0 to 999, got 1000"),
         (["object=tram", "query=1", "noises=0"], "noises must be a whole number, at least 1, got 0"),
         (["object=tram", "query=1", "batch=none"], "batch must be a whole number, at least 1, got none"),
-        (["object=tram", "query=1", "latitude_step_degrees=few"], "latitude_step_degrees must be a number, got few"),
+        (
+            ["object=tram", "query=1", "latitude_step_degrees=few"],
+            "latitude_step_degrees=few does not fit; expected float",
+        ),
         (["azimuths=1"], "azimuths must be a whole number, at least 2, got 1"),
         (["latitude_step_degrees=100"], "latitudes need a limit between 0 and 180 degrees and a step up to it"),
     ],

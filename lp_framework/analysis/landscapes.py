@@ -131,39 +131,37 @@ def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
     return sorted((valley for valley in found if valley[2] >= least), key=lambda valley: valley[1])
 
 
-def landscape_grid(latitude_limit: float = 60.0, latitude_step: float = 8.0, longitude_step: float = 12.0) -> Grid:
-    """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) of a landscape, of steps in degrees.
+def landscape_grid(
+    latitude_limit_degrees: float = 60.0, latitude_step_degrees: float = 8.0, longitude_step_degrees: float = 12.0
+) -> Grid:
+    """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) of a landscape; the defaults are the paper's.
 
-    Latitudes go from minus `latitude_limit` up; the defaults are the paper's 16 x 30. `UserError` where the longitudes
-    would not be even over the turn.
+    Latitudes go from minus the limit up. `UserError` where the longitudes would not be even over the turn.
 
     >>> [len(each) for each in landscape_grid()]
     [16, 30]
     """
-    if not 0 < latitude_limit < 180 or not 0 < latitude_step <= latitude_limit:
-        raise UserError(
-            f"latitudes need a limit between 0 and 180 degrees and a step up to it, got {latitude_limit} by "
-            f"{latitude_step}"
-        )
+    limit, step, longitude_step = latitude_limit_degrees, latitude_step_degrees, longitude_step_degrees
+    if not 0 < limit < 180 or not 0 < step <= limit:
+        raise UserError(f"latitudes need a limit between 0 and 180 degrees and a step up to it, got {limit} by {step}")
     count = round(360 / longitude_step) if 0 < longitude_step <= 120 else 0
     if count < 3 or abs(count * longitude_step - 360) > 1e-6:
         raise UserError(f"longitude_step_degrees must divide 360 into three or more, got {longitude_step}")
-    rows = math.floor(2 * latitude_limit / latitude_step + 1e-9) + 1
-    latitude = torch.arange(rows, dtype=torch.float64) * latitude_step - latitude_limit
+    latitude = torch.arange(math.floor(2 * limit / step + 1e-9) + 1, dtype=torch.float64) * step - limit
     longitude = torch.arange(count, dtype=torch.float64) * (360 / count)
     return latitude.deg2rad().float(), longitude.deg2rad().float()
 
 
-def cell_grid(spacing: float, limit: float = 60.0) -> Grid:
+def cell_grid(spacing: float) -> Grid:
     """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) at the centres of cells, for arrows.
 
-    The cells, of about `spacing` degrees, fill longitudes 0..360 and latitudes -`limit`..`limit` (degrees).
+    The cells, of about `spacing` degrees, fill longitudes 0..360 and latitudes -60..60 (degrees).
 
     >>> torch.rad2deg(cell_grid(60.0)[0])
     tensor([-30.0000,  30.0000])
     """
-    rows, columns = max(1, round(2 * limit / spacing)), max(1, round(360 / spacing))
-    latitude = (torch.arange(rows, dtype=torch.float64) + 0.5) * (2 * limit / rows) - limit
+    rows, columns = max(1, round(120 / spacing)), max(1, round(360 / spacing))
+    latitude = (torch.arange(rows, dtype=torch.float64) + 0.5) * (120 / rows) - 60
     longitude = (torch.arange(columns, dtype=torch.float64) + 0.5) * (360 / columns)
     return latitude.deg2rad().float(), longitude.deg2rad().float()
 

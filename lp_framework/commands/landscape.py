@@ -39,6 +39,7 @@ from lp_framework.data.photographs import on_white, photograph_files, prepared_p
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_arrays, write_json
 from lp_framework.models.pose_model import FieldValue
+from lp_framework.registry import checked
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
@@ -46,6 +47,7 @@ from lp_framework.viz.azimuth import azimuth_figure
 from lp_framework.viz.maps import minima_in_words, pair_figure, surface_figure
 from lp_framework.viz.style import save_figure
 
+GRID = ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degrees")
 OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview has no use for
 
 
@@ -56,7 +58,7 @@ def run(config: DictConfig) -> None:
     check(config)
     folder = run_folder()
     seed_run(config.seed)
-    grid = landscape_grid(config.latitude_limit_degrees, config.latitude_step_degrees, config.longitude_step_degrees)
+    grid = landscape_grid(**checked(landscape_grid, {key: config[key] for key in GRID}, ""))
     draws = checked_draws(config.timesteps, config.noises, config.seed, config.batch)
     device = choose_device(config.accelerator)
     components = Components(plain(config))
@@ -98,9 +100,6 @@ def check(config: DictConfig) -> None:
     """`UserError` for settings that no landscape has."""
     if not isinstance(config.azimuths, int) or config.azimuths < 2:
         raise UserError(f"azimuths must be a whole number, at least 2, got {config.azimuths}")
-    for key in ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degrees"):
-        if not isinstance(config[key], int | float):
-            raise UserError(f"{key} must be a number, got {config[key]}")
     if config.object is None and config.images is None:
         given = (override.partition("=")[0] for override in HydraConfig.get().overrides.task)
         for key in given:
