@@ -188,10 +188,10 @@ def test_pairs_are_picked_failures_first():
     errors = np.array([3.0, 170.0, 1.0, 60.0, 8.0, 170.0, 5.0, 90.0])
     objects = np.array([0, 1, 0, 0, 0, 1, 0, 1])
     picks = pick_examples(errors, objects, ["a", "b"], [True, False])
-    assert [pick.row for pick in picks] == [1, 3, 6, 2]  # ambiguous, worst, median, best
-    assert [pick.reason.split()[0] for pick in picks] == ["median", "worst", "median", "best"]
-    assert picks[0].reason == "median of 3 pairs without a unique answer"
-    assert picks[1].reason == "worst of 5 pairs with a unique answer"
+    assert list(picks) == [1, 3, 6, 2]  # ambiguous, worst, median, best
+    assert [reason.split()[0] for reason in picks.values()] == ["median", "worst", "median", "best"]
+    assert picks[1] == "median of 3 pairs without a unique answer"
+    assert picks[3] == "worst of 5 pairs with a unique answer"
     assert picks == pick_examples(errors, objects, ["a", "b"], [True, False])
 
 
@@ -205,7 +205,7 @@ def test_pairs_are_picked_failures_first():
 )
 def test_the_worst_the_median_and_the_best_are_picked(errors: list[float], unique_answer: bool | None, rows: list[int]):
     picks = pick_examples(np.array(errors), np.zeros(len(errors), int), ["a"], [unique_answer])
-    assert [pick.row for pick in picks] == rows
+    assert list(picks) == rows
 
 
 # ------------------------------------------------------------ errors

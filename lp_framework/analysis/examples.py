@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,13 +46,6 @@ ABOUT = (
 ARRAYS = ("truth", "starts", "trajectories", "ends", "energies", "rotation_errors", "translation_errors")
 
 
-class Pick(NamedTuple):
-    """A pair worth a picture: its row, and why."""
-
-    row: int
-    reason: str
-
-
 def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     """After `Trainer.test`: up to `MOST` pairs, the largest error first, solved again to see their trajectories.
 
@@ -65,7 +58,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
     answer = np.take_along_axis(rotation, chosen[:, None], axis=1)[:, 0]
     picks = pick_examples(answer, rows["object"].numpy(), table.names, table.unique_answer)
-    numbers = [pick.row for pick in picks]
+    numbers = list(picks)
     pairs, shown = shown_pairs(data, rows["pair"][numbers].numpy(), evaluation.device)
     starts = evaluation.starts.make(pairs, seed)
     solver, sets = evaluation.solver, evaluation.views is not None
@@ -94,7 +87,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
             rotation_errors=rotation[row],
             translation_errors=translation[row],
         )
-        for (row, reason), pair in zip(picks, shown, strict=True)
+        for (row, reason), pair in zip(picks.items(), shown, strict=True)
     ]
 
 
@@ -109,8 +102,10 @@ def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
 
 def pick_examples(
     errors: NDArray, objects: NDArray, names: Sequence[str], unique_answer: Sequence[bool | None]
-) -> list[Pick]:
-    """Up to `MOST` pairs by their rotation errors `[P]` and object indices `[P]`, the largest error first.
+) -> dict[int, str]:
+    """Rows of up to `MOST` pairs, and why they are shown; the largest error first.
+
+    `errors` are rotation errors `[P]`, `objects` indices `[P]`.
 
     The worst, the median and the best among objects with a unique answer (among all where none is labelled so), and
     the median among those without one; then the worst of each object that is not among these, objects with a unique
@@ -134,14 +129,14 @@ def pick_examples(
         if index not in shown and len(picks) < MOST:
             shown.add(index)
             picks[row] = f"worst of {(objects == index).sum()} pairs of {words(names[index])}"
-    return [Pick(row, picks[row]) for row in sorted(picks, key=lambda row: (-failed[row], row))]
+    return {row: picks[row] for row in sorted(picks, key=lambda row: (-failed[row], row))}
 
 
 # ---------------------------------------------------------------- on disk
 
 
-def save_examples(folder: Path, examples: Sequence[ShownPair]) -> Path:
-    """Write the examples into `folder`, anew; returns the JSON file, which is written last."""
+def save_examples(folder: Path, examples: Sequence[ShownPair]) -> None:
+    """Write the examples into `folder`, anew; the JSON file is written last."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for number, example in enumerate(examples):
@@ -151,7 +146,6 @@ def save_examples(folder: Path, examples: Sequence[ShownPair]) -> Path:
             save_png(folder / f"{number}_{name}.png", image)
     content = {"about": ABOUT, "examples": [as_json(example) for example in examples]}
     write_text(folder / FILE, json.dumps(content) + "\n")
-    return folder / FILE
 
 
 def read_examples(folder: Path) -> list[ShownPair]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from matplotlib.figure import Figure
@@ -65,22 +65,17 @@ class EnergyFigure(PairsFigure):
         self.draws = checked_draws(self.timesteps, self.noises, seed=0)
 
 
-def score_model(path: str | None) -> PoseModel:
-    """The score model of a training run or checkpoint; None: the one that ships."""
-    return _checked(load_model(SHIPPED / "score" if path is None else path), "score", path)
+def figure_model(kind: Literal["score", "energy"], path: str | None) -> PoseModel:
+    """The score or energy model of a training run or checkpoint; None: the score model that ships.
 
-
-def energy_model(path: str | None) -> PoseModel:
-    """The energy model of a training run or checkpoint; `UserError` with the command that trains one for None."""
-    if path is None:
+    `UserError` for a model of the other kind, and where there is none, with the command that trains one.
+    """
+    if path is None and kind == "energy":
         raise UserError(
             "this figure needs an energy model, and none ships: train one with `python -m lp_framework train "
             "model=energy hydra.run.dir=runs/energy`, then add figure.energy=runs/energy"
         )
-    return _checked(load_model(path), "energy", path)
-
-
-def _checked(model: PoseModel, wanted: str, path: str | None) -> PoseModel:
-    if model.has_energy != (wanted == "energy"):
-        raise UserError(f"figure.{wanted}={path}: holds no {wanted} model")
+    model = load_model(SHIPPED / "score" if path is None else path)
+    if model.has_energy != (kind == "energy"):
+        raise UserError(f"figure.{kind}={path}: holds no {kind} model")
     return model

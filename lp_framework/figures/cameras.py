@@ -16,7 +16,7 @@ from lp_framework.analysis.shown import words
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import read_image
 from lp_framework.errors import UserError
-from lp_framework.figures.base import PaperFigure, score_model
+from lp_framework.figures.base import PaperFigure, figure_model
 from lp_framework.geometry import apply_relative_pose
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
@@ -47,7 +47,7 @@ class CamerasFigure(PaperFigure):
         if not self.objects or not self.methods or self.targets < 1 or self.starts < 1:
             raise UserError("figure.objects and figure.methods need a name each, targets and starts at least 1")
         wanted = {part for name in self.methods for part in registry.component_names(registry.get("solver", name))}
-        self.model = score_model(self.score) if "model" in wanted else None
+        self.model = figure_model("score", self.score) if "model" in wanted else None
         built = {"prior": self.prior, "model": self.model}
         self.solvers = [registry.build("solver", name, **built) for name in self.methods]
         self.named = [NAMES.get(name, words(name)) for name in self.methods]

@@ -22,7 +22,7 @@ from lp_framework.analysis.fields import (
 from lp_framework.analysis.landscapes import Arrows, Landscape, cell_grid, landscape_grid
 from lp_framework.analysis.pairs import named_pairs, object_index, truths
 from lp_framework.analysis.shown import PoseMap, ShownPair
-from lp_framework.figures.base import EnergyFigure, PairsFigure, energy_model, score_model
+from lp_framework.figures.base import EnergyFigure, PairsFigure, figure_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
@@ -53,7 +53,7 @@ class ToyFigure(EnergyFigure):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.energy_model, self.score_model = energy_model(self.energy), score_model(self.score)
+        self.energy_model, self.score_model = figure_model("energy", self.energy), figure_model("score", self.score)
 
     def analyse(self, seed: int, device: torch.device) -> tuple[ShownPair, dict[str, Landscape]]:
         """A pair with four maps of score fields, and exp(-E) of both energies by title, at the true relative radius."""
@@ -96,7 +96,7 @@ class ScoreVsEnergyFigure(PairsFigure):
     energy: str | None = None
 
     def __post_init__(self) -> None:
-        self.energy_model, self.score_model = energy_model(self.energy), score_model(self.score)
+        self.energy_model, self.score_model = figure_model("energy", self.energy), figure_model("score", self.score)
 
     def analyse(self, seed: int, device: torch.device) -> list[ShownPair]:
         """Three maps a pair, at its true relative radius; nothing is drawn at random."""
