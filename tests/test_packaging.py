@@ -59,30 +59,31 @@ def test_the_wheel_holds_every_file_of_the_package_the_configs_and_the_licence(w
     assert {name.partition("/")[0] for name in names} == {"lp_framework", "lp_framework-0.1.0.dist-info"}
 
 
-def test_the_installed_command_finds_its_configs_from_another_folder(installed, tmp_path):
-    printed = run(installed / "lp", "train", "--cfg", "job", cwd=tmp_path).stdout
-    assert OmegaConf.create(printed).model.name == "score"
+def test_the_installed_command_finds_its_configs_plugins_and_weights_from_another_folder(installed, tmp_path):
+    """In few processes, because each imports PyTorch."""
     assert run(installed / "lp", "--version", cwd=tmp_path).stdout == "lp_framework 0.1.0\n"
-    where = "import lp_framework.registry as c; print(c.__file__, c.conf_dir())"
-    module, conf = run(installed / "python", "-c", where, cwd=tmp_path).stdout.split()
+    module, conf, config, listing, ours = run(installed / "python", "-c", INSTALLED, cwd=tmp_path).stdout.split(PART)
     assert Path(conf) == Path(module).parent / "conf" and ROOT not in Path(conf).parents
-
-
-def test_a_plugin_installed_as_a_package_is_chosen_on_the_command_line(installed, tmp_path):
-    printed = run(installed / "lp", "train", "backbone=color_grid", "--cfg", "job", cwd=tmp_path).stdout
-    assert OmegaConf.create(printed).backbone == {
-        **{"name": "color_grid", "grid": 8, "features": 128, "image_size": 64},
-    }
-    listing = run(installed / "lp", "plugins", cwd=tmp_path).stdout
+    chosen = OmegaConf.create(config)
+    assert chosen.model.name == "score"
+    assert chosen.backbone == {"name": "color_grid", "grid": 8, "features": 128, "image_size": 64}
     assert re.search(r"^color_grid +package lp-color-grid 0\.1\.0 +grid=8, ", listing, re.MULTILINE)
+    assert ours == "(192, 1, 1) 9\n"
 
 
-def test_the_wheel_has_the_weights_and_the_papers_numbers(installed, tmp_path):
-    code = (
-        "import lp_framework; from lp_framework.report.paper import paper_tables; "
-        "print(lp_framework.load_prior('tiny').latent_shape, len(paper_tables()))"
-    )
-    assert run(installed / "python", "-c", code, cwd=tmp_path).stdout == "(192, 1, 1) 9\n"
+PART = "-" * 20
+INSTALLED = f"""
+import sys
+import lp_framework
+from lp_framework import cli, registry
+print(registry.__file__, registry.conf_dir(), sep="{PART}", end="{PART}")
+for arguments in (["train", "backbone=color_grid", "--cfg", "job"], ["plugins"]):
+    sys.argv = ["lp", *arguments]
+    assert cli.main() == 0
+    print("{PART}", end="")
+from lp_framework.report.paper import paper_tables
+print(lp_framework.load_prior("tiny").latent_shape, len(paper_tables()))
+"""
 
 
 def test_every_dependency_is_pinned_once_for_a_python():
@@ -106,9 +107,7 @@ def python(code: str, cwd: Path) -> str:
     return run(sys.executable, "-c", f"import sys; sys.path[:0] = ['.', {str(ROOT)!r}]; {code}", cwd=cwd).stdout.strip()
 
 
-@pytest.mark.parametrize(
-    "call", ["t.ensure(); t.ensure()", "t.install(); t.install()", "t.install(); import lightning"]
-)
+@pytest.mark.parametrize("call", ["t.install(); t.install(); t.ensure(); t.ensure()", "t.install(); import lightning"])
 def test_torchvision_can_be_imported_whatever_its_operators(tmp_path, call):
     code = f"from lp_framework import torchvision_ops as t; {call}; import torch, torchvision.models as m"
     assert python(f"{code}; print(m.resnet18().eval()(torch.zeros(1, 3, 32, 32)).shape[1])", tmp_path) == "1000"
