@@ -124,7 +124,8 @@ def _restored() -> Iterator[None]:
         yield
     finally:
         sys.argv = argv
-        os.environ.clear()
+        for key in {*os.environ} - {*environment}:
+            del os.environ[key]
         os.environ.update(environment)
 
 
@@ -206,11 +207,12 @@ def explain(error: Exception) -> str:
     """What to tell a user of an error that Hydra or OmegaConf raised."""
     cause = error.__cause__ or error.__context__
     match error:
+        case MissingConfigException(missing_cfg_file=str(file)) if file.startswith("hydra/launcher/"):
+            group, _, choice = file.rpartition("/")
+            install = f"pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]'"
+            return f"{group}={choice} is not there ({_known(catalogue.choices(group))}); launchers come with {install}"
         case MissingConfigException(missing_cfg_file=str(file), options=options) if options is not None:
             group, _, choice = file.rpartition("/")
-            if group == "hydra/launcher":
-                extra = f"pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]'"
-                return f"{group}={choice} is not installed ({_known(options)}; more come with {extra})"
             return f"{group}={choice}: there is no {group} '{choice}'{nearest(choice, options)} ({_known(options)})"
         case OverrideParseException():
             return f"cannot read '{error.override}': {one_line(error) if '=' in error.override else 'write KEY=VALUE'}"

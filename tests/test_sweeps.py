@@ -191,35 +191,43 @@ def test_an_experiment_goes_on_in_its_own_folder(commands):
 # ---------------------------------------------------------------- launchers
 
 
-@pytest.mark.parametrize(
-    ("package", "launcher", "gammas"),
-    [
-        ("joblib", ("hydra/launcher=side_by_side",), (0, 0.3)),
-        ("submitit", ("hydra/launcher=submitit_local",), (0.3,)),
-        ("submitit", ("hydra/launcher=slurm", "hydra.launcher.gpus_per_node=null"), (0, 0.3)),
-        ("ray", ("hydra/launcher=ray_cluster", "hydra.launcher.ray.remote.num_cpus=1"), (0, 0.3)),
-    ],
-    ids=lambda value: value[0].partition("=")[2] if isinstance(value, tuple) and isinstance(value[0], str) else "",
-)
-def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice(
-    commands, monkeypatch, package, launcher, gammas
-):
-    pytest.importorskip(f"hydra_plugins.hydra_{package}_launcher", reason="the launchers are in extras, sweeps and ray")
+@pytest.fixture
+def elsewhere(commands, monkeypatch) -> str:
+    """A plugin of a solver, as an argument; and a Slurm that runs its jobs here."""
     if not (commands.folder / "slurm").exists():
         slurm_stand_in.install(commands.folder / "slurm")
+        (commands.folder / "elsewhere").mkdir()
+        (commands.folder / "elsewhere" / "tmp_tiny_quick.py").write_text(QUICK)
     monkeypatch.setenv("PATH", f"{commands.folder / 'slurm'}{os.pathsep}{os.environ['PATH']}")
-    quick = commands.folder / "plugins" / "tmp_tiny_quick"
-    quick.mkdir(exist_ok=True)
-    (quick / "tmp_tiny_quick.py").write_text(QUICK)
-    name = launcher[0].partition("=")[2]
-    sweep = ("experiment=gamma", f"hydra.sweep.dir={name}", "solver=tmp_tiny_quick", "checkpoint=./score", "seed=0",
-             f"solver.gamma={','.join(map(str, gammas))}")  # fmt: skip
-    ran = commands.process("unused", "eval", *sweep, *launcher)
-    assert ran.status == 0, ran.err
-    folders = sorted(file.parent for file in (commands.folder / name).rglob("results.json"))
-    assert tuple(result(folder)["config"]["solver"]["gamma"] for folder in folders) == gammas
-    again = commands.here("unused", "eval", *sweep)  # in this process, but the same sweep
-    assert again.status == 0 and again.out.count("skipped, finished before: ") == len(gammas)
+    return "plugins=[elsewhere]"
+
+
+@pytest.mark.parametrize(
+    ("package", "launcher"),
+    [
+        ("joblib", ("hydra/launcher=side_by_side",)),
+        ("submitit", ("hydra/launcher=slurm", "hydra.launcher.gpus_per_node=null")),
+        ("ray", ("hydra/launcher=ray_cluster", "hydra.launcher.ray.remote.num_cpus=1")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice(
+    commands, elsewhere, package, launcher
+):
+    pytest.importorskip(f"hydra_plugins.hydra_{package}_launcher", reason="the launchers are in extras, sweeps and ray")
+    sweep = ("experiment=gamma", f"hydra.sweep.dir={package}", elsewhere, "solver=tmp_tiny_quick",
+             "checkpoint=./score", "seed=0")  # fmt: skip
+    gammas = "0,-1,0.3" if package == "joblib" else "0,0.3"  # a job that fails does not stop the others
+    run = commands.process if package == "joblib" else commands.here  # what joblib's workers print is not caught here
+    ran = run("unused", "eval", *sweep, f"solver.gamma={gammas}", *launcher)
+    if package == "joblib":
+        assert ran.status == 1 and "job 1 (" in ran.err and "gamma must" in ran.err and "Traceback" not in ran.err
+    else:
+        assert ran.status == 0, ran.err
+    folders = sorted(file.parent for file in (commands.folder / package).rglob("results.json"))
+    assert tuple(result(folder)["config"]["solver"]["gamma"] for folder in folders) == (0, 0.3)
+    again = commands.here("unused", "eval", *sweep, "solver.gamma=0,0.3")  # in this process, but the same sweep
+    assert again.status == 0 and again.out.count("skipped, finished before: ") == 2
 
 
 def test_what_is_asked_of_slurm(tmp_path, monkeypatch):
@@ -251,12 +259,13 @@ def test_a_launcher_that_is_not_installed(lp, monkeypatch, launcher, extra):
     monkeypatch.setitem(ConfigStore.instance().repo["hydra"], "launcher", {})
     ran = lp("eval", f"hydra/launcher={launcher}", "--cfg", "job")
     name = {"slurm": "submitit_slurm", "ray_cluster": "ray"}.get(launcher, launcher)
-    assert ran.error.startswith(f"hydra/launcher={name} is not installed (known: ")
-    assert ran.error.endswith(f"; more come with pip install 'lp_framework[{extra}]')")
+    assert ran.error.startswith(f"hydra/launcher={name} is not there (known: ")
+    assert ran.error.endswith(f"; launchers come with pip install 'lp_framework[{extra}]'")
 
 
 # A solver of a plugin.
 QUICK = '''
+from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.langevin import Langevin
@@ -267,5 +276,7 @@ class Quick(Langevin):
     """Two steps of langevin."""
 
     def __init__(self, model: PoseModel, gamma: float = 0.0) -> None:
+        if gamma < 0:
+            raise UserError("gamma must not be negative")
         super().__init__(model, gamma=gamma, iterations=2)
 '''
