@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -42,6 +43,14 @@ def commands(tmp_path_factory) -> Commands:
     return commands
 
 
+@pytest.fixture(scope="module")
+def whole(commands) -> Ran:
+    """An evaluation of all pairs in one process."""
+    ran = commands.here("whole", "eval", *EVALUATION)
+    assert ran.status == 0, ran.err
+    return ran
+
+
 def two_processes(commands: Commands, name: str, command: str, *overrides: str) -> Ran:
     """The command on two processes; that there were two is in the log of the first, which waits for the other."""
     process = commands.start(name, command, *overrides, *SPREAD)
@@ -64,17 +73,7 @@ def assert_the_same(ran: Ran, wanted: Ran) -> None:
 # ---------------------------------------------------------------- evaluation
 
 
-def test_two_processes_give_the_results_of_one_on_sets_of_views(commands):
-    settings = ("views=3", "solver=multiview", "solver.second_stage=false")
-    one = commands.here("sets_one", "eval", *EVALUATION, *settings)
-    assert one.status == 0, one.err
-    two = two_processes(commands, "sets_two", "eval", *EVALUATION, *settings)
-    assert two.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 2  # in batches of three sets, of which there are seven
-    assert_the_same(two, one)
-
-
-def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands):
-    whole = commands.here("whole", "eval", *EVALUATION)
+def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands, whole):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     line = [sys.executable, "-m", "lp_framework", *commands.arguments("killed", "eval", *EVALUATION, *SPREAD)]
     process = subprocess.Popen(
@@ -98,20 +97,22 @@ def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands):
     assert_the_same(ran, whole)
 
 
-def test_an_evaluation_that_one_process_began_is_gone_on_with_by_two(commands, monkeypatch):
-    whole = commands.here("begun_whole", "eval", *EVALUATION)
+def test_an_evaluation_of_sets_that_one_process_began_is_gone_on_with_by_two(commands, monkeypatch):
+    settings = (*EVALUATION, "views=3", "solver=multiview", "solver.second_stage=false")
+    whole = commands.here("sets_one", "eval", *settings)
+    assert whole.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 2  # in batches of three sets, of which there are seven
     solve = Evaluation.test_step
 
     def until(self: Evaluation, batch: PairBatch, batch_idx: int) -> None:
-        if batch_idx == 11:
+        if batch_idx == 4:
             raise RuntimeError("stopped")
         solve(self, batch, batch_idx)
 
     with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="stopped"):
         patch.setattr(Evaluation, "test_step", until)
-        commands.here("begun", "eval", *EVALUATION)
-    two = two_processes(commands, "begun", "eval", *EVALUATION)  # one batch is left for both
-    assert "going on: 77 pairs have been solved before" in two.out
+        commands.here("sets_two", "eval", *settings)
+    two = two_processes(commands, "sets_two", "eval", *settings)  # three batches are left for both
+    assert "going on: 24 pairs have been solved before" in two.out
     assert_the_same(two, whole)
 
 
@@ -128,7 +129,7 @@ class Share(ScoreModel):
 
 
 def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(commands, clean_registry, tmp_path):
-    settings = ("model.schedule=constant", "trainer.max_epochs=2", "data.batch_pairs=40", "data.validation_views=2")
+    settings = ("model.schedule=constant", "trainer.max_epochs=2", "data.batch_pairs=3", "data.validation_views=2")
     initial = commands.here("initial", "train", *settings, "model.learning_rate=0")
     two = two_processes(commands, "trained", "train", *settings)
 
@@ -138,7 +139,7 @@ def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(
     optimizer = model.configure_optimizers()
     loaders, here = [], SimpleNamespace(root_device=torch.device("cpu"))
     for rank in (0, 1):
-        data = PairDataModule(RenderingsData(str(commands.folder / "views")), str(tmp_path / "cache"), 16, 40, 3, 2)
+        data = PairDataModule(RenderingsData(str(commands.folder / "views")), str(tmp_path / "cache"), 16, 3, 3, 2)
         data.trainer = SimpleNamespace(global_rank=rank, world_size=2, strategy=here)
         data.cache_features(model.extractor())
         loaders.append(data.train_dataloader())
@@ -159,6 +160,16 @@ def test_two_processes_train_as_one_that_takes_the_mean_gradient_of_both_shares(
     assert trained["global_step"] == model.global_step > 2
     for name, value in trained["state_dict"].items():
         torch.testing.assert_close(value, model.state_dict()[name], rtol=1e-4, atol=1e-6, msg=name)
+    model.load_state_dict(trained["state_dict"], strict=False)
+    model.eval()
+    data.trainer.global_rank, data.trainer.world_size = 0, 1
+    batches = list(data.val_dataloader())
+    assert len(batches) == 3  # of which two processes meet one twice
+    with torch.no_grad():
+        for batch in batches:
+            model.validation_step(batch, 0)
+    loss = two.json("training.json")["final"]["val/loss"]
+    assert loss == pytest.approx(model.validation_loss.compute().item(), rel=1e-6)
     moved = max((value - initial.checkpoint()["state_dict"][name]).abs().max() for name, value in
                 trained["state_dict"].items())  # fmt: skip
     assert moved > 1e-3
@@ -172,45 +183,39 @@ def test_a_strategy_that_needs_gpus_says_so_in_a_sentence(commands):
 # ---------------------------------------------------------------- several nodes, of which this machine plays two
 
 
-def torchrun(node: int) -> tuple[list[str], dict[str, str]]:
-    """What runs on a node under `torchrun`."""
-    options = [
-        "--nnodes=2",
-        "--nproc-per-node=1",
-        f"--node-rank={node}",
-        "--master-addr=127.0.0.1",
-        "--master-port=29713",
-    ]
-    return [sys.executable, "-m", "torch.distributed.run", *options, "-m", "lp_framework"], {}
+def torchrun(node: int) -> dict[str, str]:
+    """What `torchrun --nnodes=2 --nproc-per-node=1` tells the process that it runs on a node."""
+    return {
+        "RANK": str(node), "LOCAL_RANK": "0", "GROUP_RANK": str(node), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "1",
+        "MASTER_ADDR": "127.0.0.1", "TORCHELASTIC_RUN_ID": "7",
+    }  # fmt: skip
 
 
-def slurm(node: int) -> tuple[list[str], dict[str, str]]:
-    """What `srun --nodes=2 --ntasks-per-node=1` runs on a node, and what Slurm tells it."""
-    told = {
+def slurm(node: int) -> dict[str, str]:
+    """What Slurm tells the process that `srun --nodes=2 --ntasks-per-node=1` runs on a node."""
+    return {
         "SLURM_JOB_ID": "7", "SLURM_JOB_NAME": "eval", "SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "1",
         "SLURM_NNODES": "2", "SLURM_NODELIST": "127.0.0.1", "SLURM_PROCID": str(node), "SLURM_NODEID": str(node),
-        "SLURM_LOCALID": "0", "MASTER_PORT": "29714",
+        "SLURM_LOCALID": "0",
     }  # fmt: skip
-    return [sys.executable, "-m", "lp_framework"], told
 
 
 @pytest.mark.parametrize("launch", [torchrun, slurm])
-def test_two_nodes_give_the_results_of_one(commands, launch):
-    one = commands.here(f"{launch.__name__}_one", "eval", *EVALUATION)
-    assert one.status == 0, one.err
+def test_two_nodes_give_the_results_of_one(commands, whole, launch, monkeypatch):
     name = f"{launch.__name__}_two"
     spread = ("trainer.num_nodes=2", "trainer.devices=1", "trainer.strategy=ddp", "trainer.accelerator=cpu")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
     processes = []
     for node in (0, 1):
-        line, told = launch(node)
-        line += commands.arguments(name, "eval", *EVALUATION, *spread)
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **told}
-        pipe = subprocess.PIPE
-        processes.append(
-            subprocess.Popen(line, cwd=commands.folder, env=environment, stdout=pipe, stderr=pipe, text=True)
-        )
+        with monkeypatch.context() as patch:
+            patch.setenv("MASTER_PORT", str(port))
+            for key, value in launch(node).items():
+                patch.setenv(key, value)
+            processes.append(commands.start(name, "eval", *EVALUATION, *spread))
     for process in processes:
         out, err = process.communicate(timeout=300)
         assert process.returncode == 0, out + err
     assert "MEMBER: 1/2" in (commands.folder / name / "eval.log").read_text()
-    assert_the_same(Ran(0, "", "", commands.folder / name), one)
+    assert_the_same(Ran(0, "", "", commands.folder / name), whole)

@@ -145,7 +145,7 @@ class Commands:
     def process(self, name: str, command: str, *overrides: str) -> Ran:
         """Run in a process of its own."""
         process = self.start(name, command, *overrides)
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=300)
         return Ran(process.returncode, out, err, self.folder / name)
 
 
