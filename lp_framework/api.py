@@ -49,9 +49,13 @@ def estimate_pose(
     the prior and the model that it asks for (`model` is weights that ship, a checkpoint, a run's folder or a model)
     on the GPU, where there is one; a built solver has its own.
     """
+    named = [
+        (str(picture) if isinstance(picture, str | Path) else name, picture)
+        for name, picture in (("reference", reference), ("query", query))
+    ]
     prepared = [
         prepare(open_picture(picture, name), name, remove_background=remove_background, crop=crop)
-        for picture, name in ((reference, _name(reference, "reference")), (query, _name(query, "query")))
+        for name, picture in named
     ]
     if isinstance(solver, str):
         solver = _build_solver(solver, prior, model)
@@ -110,10 +114,6 @@ def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel) 
 
 
 # ---------------------------------------------------------------- photographs as views
-
-
-def _name(picture: object, otherwise: str) -> str:
-    return str(picture) if isinstance(picture, str | Path) else otherwise
 
 
 def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Image.Image:
