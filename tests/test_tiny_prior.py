@@ -14,8 +14,16 @@ import lp_framework
 from lp_framework.errors import UserError
 from lp_framework.models.view_head import SCALE
 from lp_framework.priors.ddim import scaled_linear_alphas
-from lp_framework.priors.tiny.latents import IMAGE_SIZE, PrincipalLatents
-from lp_framework.priors.tiny.networks import CONSTANT, Gaussian, code_dim, predicted_noise, readout, steer
+from lp_framework.priors.tiny.networks import (
+    CONSTANT,
+    IMAGE_SIZE,
+    Gaussian,
+    PrincipalLatents,
+    code_dim,
+    predicted_noise,
+    readout,
+    steer,
+)
 from lp_framework.registry import discover
 
 PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1", "model.orders=2")
@@ -31,9 +39,9 @@ def draw(*shape: int, seed: int = 0) -> torch.Tensor:
 def test_latents_are_principal_components():
     pixels = draw(40, 3 * IMAGE_SIZE**2) + 3
     latents = PrincipalLatents(dim=8, scale=0.5).double()
-    assert not latents.fitted
+    assert not latents.spread.any()
     latents.fit(pixels)
-    assert latents.fitted
+    assert latents.spread.any()
     values = latents(pixels)
     torch.testing.assert_close(values.mean(dim=0), torch.zeros(8).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(values.square().mean().sqrt(), torch.tensor(0.5).double(), atol=1e-5, rtol=0)

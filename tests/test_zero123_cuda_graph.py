@@ -16,9 +16,8 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from lp_framework.benchmarks.zero123 import NARROW
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.zero123 import cuda_graph
-from lp_framework.priors.zero123.chunks import Chunks
 from lp_framework.priors.zero123.networks import Networks
-from lp_framework.priors.zero123.prior import Zero123Prior
+from lp_framework.priors.zero123.prior import Chunks, Zero123Prior
 
 SIDE = 8  # of the latents
 

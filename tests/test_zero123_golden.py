@@ -14,6 +14,7 @@ from zero123_checkpoint import golden, write_checkpoint
 from lp_framework.geometry import camera_to_world, se3_exp, view_pose
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.ddim import ddim_timesteps
+from lp_framework.priors.zero123 import prior as zero123
 from lp_framework.priors.zero123.prior import SCALE, Zero123
 
 SIGN = torch.tensor([-1.0, 1.0, 1.0])  # iFusion's (theta, azimuth, distance) has theta = -latitude
@@ -130,9 +131,11 @@ def test_decoder(prior, arrays):
     close(prior.decode(arrays["latent_mode"][:1]), arrays["decoded_ref"], 2e-3)
 
 
-def test_guided_sample(prior, code, arrays):
-    pose = arrays["poses"][:1].float() * SIGN
-    latent = prior.sample(code[:1], pose, arrays["noise"][:1], steps=5, guidance=3.0, eta=0.0)
-    close(latent, arrays["ddim_latent"], 2e-3)
-    close(prior.decode(latent / SCALE), arrays["ddim_image"], 2e-3)
+def test_guided_sample(prior, code, arrays, monkeypatch):
+    monkeypatch.setattr(zero123, "standard_normal", lambda *_: arrays["noise"][:1])
+    decode, decoded = prior.decode, []
+    monkeypatch.setattr(prior, "decode", lambda latent: decoded.append(latent) or decode(latent))
+    images = prior.generate(code[:1], arrays["poses"][:1].float() * SIGN, steps=5, guidance=3.0, eta=0.0)
+    close(decoded[0] * SCALE, arrays["ddim_latent"], 2e-3)
+    close(images, arrays["ddim_image"].clamp(-1, 1), 2e-3)
     assert np.isclose(SCALE, 0.18215)

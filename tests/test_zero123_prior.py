@@ -10,8 +10,7 @@ from zero123_checkpoint import write_checkpoint
 
 from lp_framework.errors import UserError
 from lp_framework.priors.ddim import ddim_step, ddim_timesteps, scaled_linear_alphas
-from lp_framework.priors.zero123.chunks import Chunks
-from lp_framework.priors.zero123.prior import Zero123, conditioning_vector
+from lp_framework.priors.zero123.prior import Chunks, Zero123, conditioning_vector
 
 SIDE = 8  # of the latents in tests where any will do: the networks are convolutional
 

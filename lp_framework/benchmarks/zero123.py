@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from lp_framework.benchmarks.counting import peak_bytes
 from lp_framework.benchmarks.harness import Work, worth
 from lp_framework.priors.base import Prior, ViewCode
-from lp_framework.priors.zero123.attention import Attention
 from lp_framework.priors.zero123.networks import (
     DTYPES,
     PUBLISHED,
+    Attention,
     Configs,
     Dtype,
     Networks,

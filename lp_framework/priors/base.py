@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from lp_framework.errors import UserError
 
@@ -97,3 +98,12 @@ class Prior(nn.Module, ABC):
         outside = batch and known and not 0 <= timestep.min() <= timestep.max() < self.num_timesteps
         if timestep.is_floating_point() or outside:
             raise UserError(f"timestep must hold integers from 0 to {self.num_timesteps - 1}, got {timestep.tolist()}")
+
+
+def resized(images: Tensor, side: int) -> Tensor:
+    """Images `[B, 3, side, side]` of `[B, 3, H, W]`, with antialiasing; `UserError` for other shapes."""
+    if images.ndim != 4 or images.shape[1] != 3:
+        raise UserError(f"images must be [B, 3, H, W], got {list(images.shape)}")
+    if images.shape[-2:] == (side, side):
+        return images
+    return functional.interpolate(images, [side, side], mode="bilinear", antialias=True, align_corners=False)

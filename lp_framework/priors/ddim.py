@@ -75,4 +75,6 @@ def standard_normal(like: Tensor, generator: torch.Generator | None) -> Tensor:
 
 def guided(unconditional: Tensor, conditional: Tensor, guidance: float) -> Tensor:
     """Classifier-free guidance (Ho and Salimans 2022) of predicted noise; `guidance` 1 is the conditional alone."""
+    if not guidance >= 0:
+        raise UserError(f"guidance must not be negative, got {guidance}")
     return unconditional + guidance * (conditional - unconditional)

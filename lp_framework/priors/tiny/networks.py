@@ -1,4 +1,4 @@
-"""The tiny prior's networks: an image's code, how a relative pose steers it, and the Gaussian that it predicts."""
+"""The tiny prior's networks: an image's latents and code, how a relative pose steers it, the Gaussian it predicts."""
 
 from __future__ import annotations
 
@@ -7,11 +7,101 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from lp_framework.models.view_head import scaled
-from lp_framework.priors.tiny.latents import ImageDecoder, PrincipalLatents
+from lp_framework.priors.base import resized
 
+IMAGE_SIZE = 64  # pixels a side of what is decoded
+LATENT_PIXELS = 32  # of what the latents are taken from
 CONSTANT, WAVES = 64, 8  # numbers of a code that a turn leaves as they are; waves of each order
+
+
+def shrink(images: Tensor) -> Tensor:
+    """Pixels `[B, 3 * 64 * 64]` of images `[B, 3, H, W]`."""
+    return resized(images, IMAGE_SIZE).flatten(1)
+
+
+def _halve(pixels: Tensor) -> Tensor:
+    """Pixels `[B, 3 * 64 * 64]` averaged over 2 x 2: `[B, 3 * 32 * 32]`."""
+    return functional.avg_pool2d(pixels.view(-1, 3, IMAGE_SIZE, IMAGE_SIZE), 2).flatten(1)
+
+
+def principal_components(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues `[K]`, falling, and eigenvectors `[D, K]` of rows^T rows, for `rows` `[N, D]`; K = min(N, D)."""
+    if len(rows) >= rows.shape[1]:
+        values, vectors = torch.linalg.eigh(rows.T @ rows)
+    else:  # those of the smaller product, mapped over
+        values, vectors = torch.linalg.eigh(rows @ rows.T)
+        vectors = functional.normalize(rows.T @ vectors, dim=0)
+    return values.flip(0), vectors.flip(1)
+
+
+class PrincipalLatents(nn.Module):
+    """The first `dim` principal components of 32 x 32 images, scaled so that their mean square is `scale`^2.
+
+    A linear map, so that noise of the latents is noise of the image; `spread` `[dim]` are the standard deviations.
+    """
+
+    mean: Tensor
+    basis: Tensor
+    spread: Tensor
+
+    def __init__(self, dim: int, scale: float) -> None:
+        super().__init__()
+        self.dim, self.scale = dim, scale
+        pixels = 3 * LATENT_PIXELS**2
+        self.register_buffer("mean", torch.zeros(pixels))
+        self.register_buffer("basis", torch.zeros(pixels, dim))  # scaled
+        self.register_buffer("spread", torch.zeros(dim))
+
+    @torch.no_grad()
+    def fit(self, pixels: Tensor) -> None:
+        """Take the basis from pixels `[I, 3 * 64 * 64]`; with fewer images than `dim` the rest of it is zero.
+
+        It is computed in float64, so on the CPU.
+        """
+        small = _halve(pixels.float()).cpu().double()
+        mean = small.mean(dim=0)
+        variances, vectors = principal_components((small - mean) / len(small) ** 0.5)
+        missing = max(0, self.dim - len(variances))
+        variances = functional.pad(variances[: self.dim].clamp(min=0), (0, missing))
+        vectors = functional.pad(vectors[:, : self.dim], (0, missing))
+        variances = torch.where(variances > 1e-9 * variances[0], variances, 0)
+        vectors = vectors * torch.where(vectors.sum(dim=0) < 0, -1, 1)  # the sign is free
+        factor = self.scale / variances.mean().sqrt()
+        self.mean.copy_(mean)
+        self.basis.copy_(vectors * (variances > 0) * factor)
+        self.spread.copy_(variances.sqrt() * factor)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Latents `[B, dim]` of pixels `[B, 3 * 64 * 64]`."""
+        return (_halve(pixels) - self.mean) @ self.basis
+
+
+class ImageDecoder(nn.Module):
+    """Latents `[B, dim]` to images `[B, 3, 64, 64]` in [-1, 1]: a linear map to 8 x 8, three doublings."""
+
+    def __init__(self, dim: int, channels: int = 64) -> None:
+        super().__init__()
+        half = channels // 2
+        self.layers = nn.Sequential(
+            nn.Linear(dim, channels * 64),
+            nn.Unflatten(1, (channels, 8, 8)),
+            nn.ReLU(),
+            nn.Upsample(scale_factor=2),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.ReLU(),
+            nn.Upsample(scale_factor=2),
+            nn.Conv2d(channels, half, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(half, 12, 3, padding=1),
+            nn.PixelShuffle(2),
+            nn.Tanh(),
+        )
+
+    def forward(self, latents: Tensor) -> Tensor:
+        return self.layers(latents)
 
 
 class Gaussian(NamedTuple):
@@ -35,9 +125,8 @@ def readout(code: Tensor, orders: int) -> Tensor:
 def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
     """Codes `[..., code_dim]` (see `code_dim`) as seen from relative poses `[..., 3]` away.
 
-    A wave of order m turns by m times the relative longitude, and the place moves by the relative latitude and radius:
-    a turn of the camera acts on the code as it acts on functions on a circle. So the result is periodic in longitude,
-    composes (`steer` by x, then by y, is `steer` by x + y) and what is learned of one pair serves all others.
+    A wave of order m turns by m times the relative longitude, and the place moves by the relative latitude and radius.
+    So the result is periodic in longitude, and `steer` by x, then by y, is `steer` by x + y.
     """
     constant, waves, place = code[..., :CONSTANT], code[..., CONSTANT:-2], code[..., -2:]
     real, imaginary = waves.unflatten(-1, (2, orders, WAVES)).unbind(dim=-3)

@@ -1,29 +1,153 @@
-"""The tiny prior as an energy over relative poses, and as a generator of novel views."""
+"""The tiny prior as an energy over relative poses, as a generator of novel views, and its training (`model=prior`)."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from lp_framework.errors import UserError
+from lp_framework.data.module import FeatureExtractor
+from lp_framework.data.pairs import PairBatch
+from lp_framework.errors import UserError, check_settings
+from lp_framework.keyed_random import keyed_bits, keyed_normal
+from lp_framework.models.backbones import Backbone
 from lp_framework.models.checkpoints import SHIPPED, find_checkpoint, read_checkpoint, restore
+from lp_framework.models.pair_mean import PairMean
+from lp_framework.models.trained_module import TrainedModule
+from lp_framework.models.view_head import relative_pose_loss
 from lp_framework.priors.base import Prior, ViewCode
-from lp_framework.priors.ddim import ddim_sample, guided, standard_normal
-from lp_framework.priors.tiny.latents import IMAGE_SIZE
-from lp_framework.priors.tiny.networks import predicted_noise
-from lp_framework.priors.tiny.training import PriorModel
+from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, standard_normal
+from lp_framework.priors.tiny.networks import IMAGE_SIZE, Gaussian, TinyNetworks, predicted_noise, readout, shrink
 from lp_framework.registry import register
+
+DECODED = 16  # images a step that the decoder is trained on; it is the costliest part
+
+
+class TrunkAndPixels:
+    """What of an image is computed once: a frozen trunk's features, and the pixels of the small image after them."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        self.backbone, self.to = backbone, backbone.to
+
+    def trunk(self, images: Tensor) -> Tensor:
+        """`[I, trunk_dim + 3 * 64 * 64]` of images `[I, 3, H, W]`."""
+        return torch.cat([self.backbone.trunk(images), shrink(images)], dim=1)
+
+    def fingerprint(self) -> str:
+        """See `FeatureExtractor`."""
+        return f"{self.backbone.fingerprint()} and pixels"
+
+
+@register("model", "prior")
+class PriorModel(TrainedModule):
+    """The tiny prior: a pose-conditioned diffusion model of small images, trained by denoising (Ho et al. 2020)."""
+
+    alphas_cumprod: Tensor
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        latent_dim: int = 192,
+        scale: float = 0.5,
+        orders: int = 4,
+        width: int = 384,
+        layers: int = 3,
+        view_loss: float = 1.0,
+        optimizer: Literal["adam", "adamw"] = "adamw",
+        learning_rate: float = 2e-3,
+        weight_decay: float = 1e-2,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
+        check_settings(
+            "model",
+            ("latent_dim", latent_dim, 1 <= latent_dim <= 3072, "from 1 to 3072"),
+            ("scale", scale, scale > 0, "positive"),
+            ("orders", orders, orders >= 1, "at least 1"),
+            ("width", width, width >= 1, "at least 1"),
+            ("layers", layers, layers >= 0, "at least 0"),
+            ("view_loss", view_loss, view_loss >= 0, "at least 0"),
+        )
+        self.networks = TinyNetworks(backbone.feature_dim, latent_dim, scale, orders, width, layers)
+        self.view_loss = view_loss
+        self.register_buffer("alphas_cumprod", scaled_linear_alphas(), persistent=False)
+        self.validation_loss = PairMean()
+
+    def extractor(self) -> FeatureExtractor | None:
+        return TrunkAndPixels(self.backbone) if self.backbone.frozen else None
+
+    def on_fit_start(self) -> None:
+        """The latents' basis is that of the training views; a run that goes on has it already."""
+        if self.networks.latents.spread.any():
+            return
+        data = self.trainer.datamodule.data("train")  # type: ignore[attr-defined]
+        views = torch.arange(len(data.table))
+        alone = [data[part[:, None].expand(-1, 2).numpy()] for part in views.split(256)]  # pairs of a view with itself
+        self.networks.latents.fit(torch.cat([self._pixels(batch) for batch in alone]).to(self.device))
+
+    def code(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Latents `[I, latent_dim]` and codes `[I, code_dim]` of images `[I, 3, H, W]` in [-1, 1]."""
+        return self.networks.latents(shrink(images)), self.networks.encoder(self.backbone(images))
+
+    def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
+        pixels = self._pixels(batch)
+        code, latents = self.networks.encoder(self._features(batch)), self.networks.latents(pixels)
+        generator = self._generator()
+        timestep = torch.randint(len(self.alphas_cumprod), (len(batch),), generator=generator).to(self.device)
+        noise = torch.randn(len(batch), latents.shape[1], generator=generator).to(self.device)
+        error, predicted = self._denoise(batch, code, latents, timestep, noise)
+        view_loss = relative_pose_loss(readout(code, self.networks.orders), batch)
+
+        # The decoder sees what it will have to decode: latents of views, and samples of what is predicted.
+        chosen = torch.randperm(len(batch), generator=generator)[:DECODED].to(self.device)
+        seen = torch.arange(len(chosen), device=self.device)[:, None] % 2 == 0
+        query = batch.query[chosen]
+        sampled = (predicted.mean + predicted.log_spread.exp() * noise)[chosen].detach()
+        image = self.networks.decoder(torch.where(seen, latents[query], sampled))
+        image_loss = functional.mse_loss(image.flatten(1), pixels[query])
+
+        loss = error.mean()
+        for name, value in (("loss", loss), ("view_loss", view_loss), ("image_loss", image_loss)):
+            self.log(f"train/{name}", value, prog_bar=True, batch_size=len(batch))
+        return loss + self.view_loss * view_loss + image_loss
+
+    def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
+        latents, ids = self.networks.latents(self._pixels(batch)), batch.ids
+        timestep = keyed_bits(self.seed, ids, count=1).squeeze(-1).to(self.device) % len(self.alphas_cumprod)
+        noise = keyed_normal(self.seed, ids, count=latents.shape[1]).to(latents)
+        error, _ = self._denoise(batch, self.networks.encoder(self._features(batch)), latents, timestep, noise)
+        self.validation_loss.update(ids, error)
+        self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
+
+    def _features(self, batch: PairBatch) -> Tensor:
+        if batch.features is None:
+            return self.backbone(batch.images)
+        return self.backbone.head(batch.features[:, : self.backbone.trunk_dim])
+
+    def _pixels(self, batch: PairBatch) -> Tensor:
+        return shrink(batch.images) if batch.features is None else batch.features[:, self.backbone.trunk_dim :]
+
+    def _denoise(
+        self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor
+    ) -> tuple[Tensor, Gaussian]:
+        """Denoising errors `[P]` of the pairs' queries seen from their references, and what was predicted."""
+        alpha = self.alphas_cumprod[timestep][:, None]
+        noisy = alpha.sqrt() * latents[batch.query] + (1 - alpha).sqrt() * noise
+        predicted = self.networks.predict(code[batch.reference], batch.relative_poses())
+        error = (predicted_noise(noisy, alpha, predicted) - noise).square().mean(dim=1)
+        return error, predicted
 
 
 @register("prior", "tiny")
 class TinyPrior(Prior):
-    """A small diffusion model that comes trained on the embedded objects; `path`: one of your own training.
+    """A small diffusion model that comes trained on the embedded objects.
 
-    `path` is a run of `train model=prior`, or a folder that `convert` made of it.
-
-    The target's latents are predicted to be Gaussian, with a mean and a spread that depend on source and pose, so the
-    denoiser has a closed form and never finds the target's pose in the noised target itself: the energy depends on the
-    pose at every timestep.
+    `path`, for one of your own, is a run of `train model=prior`, or a folder that `convert` made of it. The target's
+    latents are predicted to be Gaussian, with a mean and a spread that depend on source and pose, so the denoiser has a
+    closed form and never finds the target's pose in the noised target: the energy depends on it at every timestep.
     """
 
     def __init__(self, path: str | None = None) -> None:
@@ -40,8 +164,6 @@ class TinyPrior(Prior):
     @torch.no_grad()
     def encode(self, images: Tensor) -> ViewCode:
         """See `Prior.encode`: principal components `[B, D, 1, 1]`, and a code that poses steer `[B, 1, code_dim]`."""
-        if images.ndim != 4 or images.shape[1] != 3:
-            raise UserError(f"images must be [B, 3, H, W], got {list(images.shape)}")
         latents, codes = self.model.code(images.float())
         return ViewCode(latents[..., None, None], codes[:, None])
 
@@ -63,8 +185,6 @@ class TinyPrior(Prior):
         generator: torch.Generator | None = None,
         eta: float = 1.0,
     ) -> Tensor:
-        if not guidance >= 0:
-            raise UserError(f"guidance must not be negative, got {guidance}")
         networks, alphas = self.model.networks, self.model.alphas_cumprod
         # Without a source the prediction is the Gaussian of all training views.
         predicted, anything = networks.predict(source.embedding[:, 0], pose.float()), networks.marginal()

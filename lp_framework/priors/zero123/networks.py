@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from types import ModuleType
 from typing import Any, Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+from torch.nn import functional
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.priors.zero123.tensor_files import StoredTensor
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 Dtype = Literal["float32", "bfloat16", "float16"]
+Attention = Literal["sdpa", "math"]
 
 # Configs in the words of diffusers' and transformers' config.json, and the tensors of each network by their names.
 Configs = Mapping[str, Mapping[str, Any]]
@@ -94,6 +99,40 @@ class Networks(nn.Module):
         self.image_encoder = transformers.CLIPVisionModelWithProjection(clip)
         embedding = self.image_encoder.config.projection_dim
         self.cc_projection = nn.Linear(embedding + POSE_CHANNELS, self.unet.config.cross_attention_dim)
+
+
+class SingleToken:
+    """Cross-attention over one token: its weight is 1 whatever the query, so every position receives its value."""
+
+    def __call__(self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor, **unused: Any) -> Tensor:
+        value = attn.to_out[0](attn.to_v(encoder_hidden_states))  # [B, 1, channels]
+        return value.expand(-1, hidden_states.shape[1], -1)
+
+
+class SelfAttention:
+    """Self-attention by `scaled_dot_product_attention`, with PyTorch's plain kernel where a fused one cannot do."""
+
+    def __init__(self, kernel: Attention) -> None:
+        self.kernel = kernel
+
+    def __call__(self, attn: Any, hidden_states: Tensor, **unused: Any) -> Tensor:
+        query, key, value = (
+            project(hidden_states).unflatten(-1, (attn.heads, -1)).transpose(1, 2)  # [B, heads, positions, channels]
+            for project in (attn.to_q, attn.to_k, attn.to_v)
+        )
+        plain = self.kernel == "math" or forward_ad._current_level >= 0  # fused kernels have no forward-mode derivative
+        with sdpa_kernel(SDPBackend.MATH) if plain else nullcontext():
+            mixed = functional.scaled_dot_product_attention(query, key, value)
+        return attn.to_out[0](mixed.transpose(1, 2).flatten(2))
+
+
+def choose_attention(unet: Any, kernel: Attention) -> None:
+    """Give a U-Net whose context is a single token these processors."""
+    processors = {
+        name: SingleToken() if name.endswith("attn2.processor") else SelfAttention(kernel)
+        for name in unet.attn_processors
+    }
+    unet.set_attn_processor(processors)
 
 
 def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> Networks:

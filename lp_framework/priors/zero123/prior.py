@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from lp_framework.errors import UserError
-from lp_framework.priors.base import Prior, ViewCode
+from lp_framework.priors.base import Prior, ViewCode, resized
 from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, standard_normal
-from lp_framework.priors.zero123.attention import Attention, choose_attention
-from lp_framework.priors.zero123.chunks import Chunks, EnergyAndSlope
 from lp_framework.priors.zero123.cuda_graph import Replayed
-from lp_framework.priors.zero123.networks import Dtype, Networks
+from lp_framework.priors.zero123.networks import Attention, Dtype, Networks, choose_attention
 from lp_framework.priors.zero123.original import Averages
 from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.registry import register
@@ -25,6 +24,8 @@ STEEPER = 4096  # times the energy is differentiated, lest small slopes vanish i
 SCALE = 0.18215  # of latents before noise is added; the latent of the source is not scaled
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+_Result = TypeVar("_Result")
 
 
 def conditioning_vector(pose: Tensor) -> Tensor:
@@ -38,6 +39,60 @@ def conditioning_vector(pose: Tensor) -> Tensor:
     """
     latitude, longitude, radius = pose.unbind(-1)
     return torch.stack([-latitude, longitude.sin(), longitude.cos(), radius], dim=-1)
+
+
+class Chunks:
+    """Runs a function on slices of a batch, at most `size` long (None: all of it).
+
+    When a GPU runs out of memory, `release` gives back what it can and says whether that was anything; else the size is
+    halved for good. Then the rest of the batch is tried again.
+    """
+
+    def __init__(self, size: int | None, release: Callable[[], bool] | None = None) -> None:
+        self.size, self.release = size, release
+
+    def run(self, function: Callable[[slice], _Result], batch: int) -> list[_Result]:
+        """The results for `slice(0, size)`, `slice(size, 2 * size)`, ... of a batch."""
+        results: list[_Result] = []
+        start = 0
+        while start < batch:
+            stop = min(start + (self.size or batch), batch)
+            try:
+                results.append(function(slice(start, stop)))
+            except torch.cuda.OutOfMemoryError:
+                if self.release is None or not self.release():
+                    if stop - start == 1:
+                        raise
+                    self.size = (stop - start) // 2
+            else:
+                start = stop
+                continue
+            torch.cuda.empty_cache()  # here the exception, and with it the tensors of the failed attempt, are gone
+        return results
+
+
+class EnergyAndSlope(torch.autograd.Function):
+    """Energies `[B]` of poses `[B, 3]` whose gradient is computed at once, chunk by chunk.
+
+    Each energy depends on its own pose alone, so its gradient is a row `[3]`, kept in the place of the network's
+    activations; `both` computes the two of a chunk. Differentiable once; for more use the residual.
+    """
+
+    @staticmethod
+    def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
+        energies, slopes = zip(*chunks.run(both, len(pose)), strict=True)
+        return torch.cat(energies), torch.cat(slopes)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, None, None]:
+        (slopes,) = ctx.saved_tensors
+        return grad[:, None] * slopes, None, None
 
 
 class Zero123Prior(Prior):
@@ -92,16 +147,10 @@ class Zero123Prior(Prior):
         self.replayed.forget()
         return super()._apply(function, recurse)
 
-    # ------------------------------------------------------------ images
-
     @torch.no_grad()
     def encode(self, images: Tensor) -> ViewCode:
         """See `Prior.encode`: the mode of the autoencoder's posterior, unscaled, and CLIP's embedding `[B, 1, 768]`."""
-        if images.ndim != 4 or images.shape[1] != 3:
-            raise UserError(f"images must be [B, 3, H, W], got {list(images.shape)}")
-        size = [self.image_size, self.image_size]
-        if list(images.shape[-2:]) != size:
-            images = functional.interpolate(images, size, mode="bilinear", antialias=True, align_corners=False)
+        images = resized(images, self.image_size)
         parts = self.image_chunks.run(lambda part: self._encode(images[part]), len(images))
         latents, embeddings = zip(*parts, strict=True)
         return ViewCode(torch.cat(latents), torch.cat(embeddings))
@@ -120,8 +169,6 @@ class Zero123Prior(Prior):
         """Images `[B, 3, image_size, image_size]` (not clipped) of unscaled latents `[B, *latent_shape]`."""
         parts = self.image_chunks.run(lambda part: self.vae.decode(latent[part].to(self.vae.dtype)).sample, len(latent))
         return torch.cat(parts).float()
-
-    # ------------------------------------------------------------ the energy
 
     def token(self, embedding: Tensor, pose: Tensor) -> Tensor:
         """The condition `[B, 1, 768]`: the projection of the source's embedding `[B, 1, 768]` and the pose's T."""
@@ -177,8 +224,7 @@ class Zero123Prior(Prior):
             (slope,) = torch.autograd.grad(STEEPER * energies.sum(), pose)
         return energies.detach(), slope / STEEPER
 
-    # ------------------------------------------------------------ novel views
-
+    @torch.no_grad()
     def generate(
         self,
         source: ViewCode,
@@ -189,24 +235,6 @@ class Zero123Prior(Prior):
         eta: float = 1.0,
     ) -> Tensor:
         # The defaults are those of Zero123's and iFusion's published code.
-        start = standard_normal(pose.new_empty(len(pose), *self.latent_shape), generator)
-        latent = self.sample(source, pose, start, steps, guidance, generator, eta)
-        return self.decode(latent / SCALE).clamp(-1, 1)
-
-    @torch.no_grad()
-    def sample(
-        self,
-        source: ViewCode,
-        pose: Tensor,
-        start: Tensor,
-        steps: int,
-        guidance: float,
-        generator: torch.Generator | None = None,
-        eta: float = 1.0,
-    ) -> Tensor:
-        """The scaled latents `[B, *latent_shape]` of novel views, by DDIM from the noise `start`."""
-        if not guidance >= 0:
-            raise UserError(f"guidance must not be negative, got {guidance}")
         token = self.token(source.embedding, pose.float())
 
         def predict(latent: Tensor, timestep: int) -> Tensor:
@@ -223,7 +251,9 @@ class Zero123Prior(Prior):
 
             return torch.cat(self.chunks.run(of, len(latent)))
 
-        return ddim_sample(predict, start.float(), self.alphas_cumprod, steps, eta, generator)
+        start = standard_normal(pose.new_empty(len(pose), *self.latent_shape), generator).float()
+        latent = ddim_sample(predict, start, self.alphas_cumprod, steps, eta, generator)
+        return self.decode(latent / SCALE).clamp(-1, 1)
 
 
 @register("prior", "zero123")
