@@ -14,10 +14,9 @@ from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, se3_exp, wrap_angle
 from lp_framework.priors.zero123.prior import Zero123
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.ifusion import IFusion
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
-from lp_framework.solvers.twist import SineRadius, TanhRadius, TwistPoses
+from lp_framework.solvers.twist import IFusion, SineRadius, TanhRadius, TwistPoses
 
 WRONG_VALLEY = (
     [0.0, math.pi],

@@ -27,8 +27,7 @@ from lp_framework.priors.zero123.networks import (
 )
 from lp_framework.priors.zero123.prior import IMAGE_SIZE, Zero123Prior
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.ifusion import IFusion
-from lp_framework.solvers.twist import SineRadius, TwistPoses
+from lp_framework.solvers.twist import IFusion, SineRadius, TwistPoses
 
 _Prior = TypeVar("_Prior", bound=Prior)
 TIMESTEP = 500  # the work is that of any other

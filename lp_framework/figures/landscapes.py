@@ -21,8 +21,8 @@ from lp_framework.errors import UserError
 from lp_framework.figures.base import EnergyFigure
 from lp_framework.geometry import apply_relative_pose, camera_to_world
 from lp_framework.registry import register
-from lp_framework.solvers.ifusion import IFusion
 from lp_framework.solvers.starts import Ring
+from lp_framework.solvers.twist import IFusion
 from lp_framework.viz.panels import FailureRow, failures_figure, surfaces_figure, trajectories_figure
 
 RESOLUTION = 256  # pixels a side of the views from a mesh

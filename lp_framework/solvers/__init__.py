@@ -5,9 +5,9 @@ from lp_framework.solvers import (  # noqa: F401
     feed_forward,
     gauss_newton,
     id_pose,
-    ifusion,
     langevin,
     multiview,
     starts,
+    twist,
     two_stage,
 )

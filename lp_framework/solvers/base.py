@@ -18,8 +18,7 @@ from lp_framework.keyed_random import keyed_bits
 @dataclass(frozen=True)
 class Pairs:
     """B problems among I images: `images` `[I, 3, H, W]` in [-1, 1] on white, each once; `reference`, `query` `[B]`
-    point to them; `ids` `[B]` are integers that name the pairs for good, to which random draws are keyed.
-    """
+    point to them; `ids` `[B]` are integers that name the pairs for good, to which random draws are keyed."""
 
     images: Tensor
     reference: Tensor
@@ -44,9 +43,8 @@ def pairs_of(batch: PairBatch, device: torch.device) -> Pairs:
 
 @dataclass(frozen=True)
 class ViewSets:
-    """S problems of V >= 2 images each, among I images: `images` `[I, 3, H, W]` in [-1, 1] on white, each once; `views`
-    `[S, V]` point to them; `ids` `[S]` are integers that name the sets for good, to which random draws are keyed.
-    """
+    """S problems of V >= 2 images each: `images` and `ids` `[S]` are as those of `Pairs`; `views` `[S, V]` point to the
+    images."""
 
     images: Tensor
     views: Tensor
@@ -67,10 +65,7 @@ class ViewSets:
         return self.pairs([0] * (views - 1), range(1, views))
 
     def pairs(self, reference: Sequence[int], query: Sequence[int]) -> Pairs:
-        """P pairs of places within a set, for every set: S x P problems, those of a set together.
-
-        Their ids are keyed by the set's id and the two places.
-        """
+        """P pairs of places within a set, for every set: S x P problems, those of a set together, ids keyed by both."""
         places = torch.tensor([list(reference), list(query)])
         ids = keyed_bits(self.ids[:, None], *places, count=1).to(self.ids.device)
         chosen = self.views[:, places.to(self.views.device)]  # [S, 2, P]
@@ -95,8 +90,7 @@ class Solution:
     """`poses` `[B, N, 3]` final relative poses, `energies` `[B, N]` (lower is better, comparable along N), `valid`
     `[B, N]`, `chosen` `[B]` index of the start that is the answer; `cameras` `[B, N, 4, 4]` of solvers that predict
     full ones: the query's in the reference's frame, its translation up to a factor (see `geometry.two_view`);
-    `trajectory` `[B, N, steps + 1, 3]` on request, longitudes unreduced.
-    """
+    `trajectory` `[B, N, steps + 1, 3]` on request, longitudes unreduced."""
 
     poses: Tensor
     energies: Tensor
@@ -114,8 +108,7 @@ class Solution:
 @dataclass(frozen=True)
 class ViewSolution:
     """`poses` `[S, V - 1, 3]` of the other views relative to the first; `energies` `[S, V, V]` of the ordered pairs
-    (row: reference, column: query; NaN where a solver did not look); `valid` `[S]`: every pose is sound.
-    """
+    (row: reference, column: query; NaN where a solver did not look); `valid` `[S]`: every pose is sound."""
 
     poses: Tensor
     energies: Tensor

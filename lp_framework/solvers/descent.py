@@ -69,6 +69,9 @@ class Plateau:
         self.bad = self.bad.masked_fill(late, 0)
 
 
+Energy = Callable[[Tensor, int], Tensor]  # of poses [B, N, P] at a step, [B, N]
+
+
 class Descended(NamedTuple):
     """`trajectory` `[B, N, steps + 1, P]` from the starts to the ends; `total` `[B, N]`, the sum of the energies met;
     `valid` `[B, N]`."""
@@ -79,7 +82,7 @@ class Descended(NamedTuple):
 
 
 def descend(
-    energy: Callable[[Tensor, int], Tensor],
+    energy: Energy,
     pose_of: Callable[[Tensor], Tensor],
     parameters: Tensor,
     steps: int,

@@ -16,7 +16,7 @@ from lp_framework.geometry import from_opencv, inverse
 from lp_framework.keyed_random import keyed_bits
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.relative_cameras import RelativeCameraSolver, with_weights
+from lp_framework.solvers.feed_forward import RelativeCameraSolver, with_weights
 
 INSTALL = "pip install 'lp_framework[features]'"
 MINIMAL = 5  # matches that fix an essential matrix
@@ -33,12 +33,9 @@ WHITE = 0.98  # of [-1, 1]: what is darker in some channel is the object's
 class Features(RelativeCameraSolver):
     """Matched local features and their essential matrix; one answer a pair, or none.
 
-    The essential matrix is that of PoseLib's LO-RANSAC, refined on its inliers, for square images. With fewer than
-    `fewest_inliers` of them there is no answer. Matches that have mostly not moved by more than `tolerance_pixels` say
-    that both images are from the same place, where an essential matrix says nothing.
-
-    The energy of an answer is the share of matches that do not fit it. RANSAC draws by seed and pair. See
-    `RelativeCameraSolver` for `reference_radius` and the cameras.
+    The essential matrix is that of PoseLib's LO-RANSAC (keyed by seed and pair), refined on its inliers, for square
+    images. With fewer than `fewest_inliers` of them there is no answer. Where most matches have moved by no more than
+    `tolerance_pixels`, both images are from the same place. The energy is the share of matches that do not fit.
     """
 
     def __init__(
@@ -86,11 +83,8 @@ class Features(RelativeCameraSolver):
         return flip @ from_opencv(cameras), energies, 0 if self.network is None else len(pairs)
 
     def relative_camera(self, matches: Matches, width: int, seed: int) -> tuple[NDArray[np.float64], float] | None:
-        """The query's camera in the reference's frame, `[4, 4]` with OpenCV's axes and a translation of length 1, and
-        the share of matches that do not fit it; None where there are too few.
-
-        Where the camera has not moved it is the identity.
-        """
+        """The query's camera in the reference's frame, `[4, 4]` with OpenCV's axes and a translation of length 1 (0
+        where it has not moved), and the share of matches that do not fit it; None where there are too few."""
         count = len(matches.reference)
         if count < self.fewest_inliers:
             return None
@@ -107,9 +101,6 @@ class Features(RelativeCameraSolver):
         to_query = np.eye(4)
         to_query[:3, :3], to_query[:3, 3] = pose.R, pose.t / np.linalg.norm(pose.t)
         return inverse(torch.from_numpy(to_query)).numpy(), 1 - report["num_inliers"] / count
-
-
-# ---------------------------------------------------------------- matchers: every image is described once
 
 
 class Matches(NamedTuple):
@@ -195,8 +186,7 @@ class Learned:
 
 def foreground(image: Tensor) -> NDArray[np.bool_]:
     """Where the object is, `[H, W]`, in an image `[3, H, W]` on white: what is not white, and white within it."""
-    filled: NDArray[np.bool_] = binary_fill_holes((image.amin(dim=0) < WHITE).cpu().numpy())
-    return filled
+    return np.asarray(binary_fill_holes((image.amin(dim=0) < WHITE).cpu().numpy()))
 
 
 def pixels(image: Tensor) -> NDArray[np.uint8]:

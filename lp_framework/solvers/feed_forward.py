@@ -1,29 +1,79 @@
-"""DUSt3R and VGGT: networks that predict both cameras of a pair at once. The packages are their authors'."""
+"""Solvers that see a pair and predict its relative camera, without descent: the networks DUSt3R and VGGT."""
 
 from __future__ import annotations
 
 import argparse
 from abc import abstractmethod
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from lp_framework.errors import UserError, optional_import
-from lp_framework.geometry import from_opencv, inverse, relative_camera, rigid_transform
+from lp_framework.clock import now
+from lp_framework.errors import UserError, check_settings, optional_import
+from lp_framework.geometry import from_opencv, inverse, pose_of_relative_camera, relative_camera, rigid_transform
 from lp_framework.registry import register
-from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.relative_cameras import RelativeCameraSolver, with_weights
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts
+
+Loaded = TypeVar("Loaded")
+
+
+class RelativeCameraSolver(Solver):
+    """One answer a pair (N = 1), **starts are ignored**; a pair without an answer is invalid and its pose NaN.
+
+    The `Solution` has full cameras, whose translations are known up to a factor. Its poses are theirs as
+    `pose_of_relative_camera` has them, with the reference `reference_radius` (object sizes) from the object's centre;
+    1.4 is where `estimate` puts that of prepared photographs.
+    """
+
+    one_answer = True
+
+    def __init__(self, reference_radius: float) -> None:
+        check_settings("solver", ("reference_radius", reference_radius, reference_radius > 0, "positive"))
+        self.reference_radius = reference_radius
+
+    @abstractmethod
+    def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
+        """Relative cameras `[B, 4, 4]` (float64; NaN: none), energies `[B]`, and passes through the network."""
+
+    @torch.no_grad()
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        check_starts(pairs, starts)
+        began = now(starts.device)
+        cameras, energies, passes = self.predict(pairs, seed)
+        poses = pose_of_relative_camera(cameras, self.reference_radius)
+        return Solution(
+            poses=poses.to(starts)[:, None],
+            energies=energies.to(starts)[:, None],
+            valid=cameras.isfinite().all(dim=-1).all(dim=-1).to(starts.device)[:, None],
+            chosen=torch.zeros(len(pairs), dtype=torch.int64, device=starts.device),
+            cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
+            cameras=cameras.to(starts)[:, None],
+        )
+
+
+def with_weights(load: Callable[[str], Loaded], network: str, weights: str) -> Loaded:
+    """What `load` makes of the weights of a network (a file, a folder or a hub id); `UserError` where it cannot."""
+    if Path(weights).suffix in (".pt", ".pth", ".safetensors") and not Path(weights).is_file():
+        raise UserError(f"{weights}: there is no such file with the weights of {network}")
+    try:
+        return load(weights)
+    except Exception as error:  # the hub's package and its HTTP libraries have many of their own
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(
+            f"{weights}: the weights of {network} cannot be had from there ({reason}); "
+            "give solver.weights= a local path or an id of the Hugging Face hub"
+        ) from error
 
 
 class FeedForward(RelativeCameraSolver):
     """A network that sees a pair, the reference first, and predicts both cameras, in any frame and at any scale.
 
-    The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`. See
-    `RelativeCameraSolver` for `reference_radius` and the cameras.
+    The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`.
     """
 
     patch: int
@@ -57,8 +107,7 @@ class FeedForward(RelativeCameraSolver):
 class Dust3r(FeedForward):
     """DUSt3R (Wang et al. 2024): point maps of both images, and the cameras that fit them; one answer a pair.
 
-    Images are the authors' own preparation with `square_ok`: whole. The cameras are those of their `PairViewer`: both
-    orders of the images go through the network, and the more confident one's points fix the other camera.
+    Both orders of the images go through the network; the cameras are those of the authors' `PairViewer`.
     """
 
     patch, passes_per_pair = 16, 2

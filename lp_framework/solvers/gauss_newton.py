@@ -38,13 +38,11 @@ class GaussNewton(Solver):
     """Ours: first stage `langevin`, then Levenberg-Marquardt on the prior's residuals, all starts at once.
 
     A pair's energy is a mean of squares, of the residuals of both directions under one noise for each of `timesteps`,
-    drawn once: every step descends the same function. Forward-mode derivatives along the three numbers of the pose
-    give its Jacobian, at the price of eight passes a timestep; the prior has to have them under `torch.func.vmap`.
+    drawn once: every step descends the same function. Its Jacobian is by forward-mode derivatives (eight passes a
+    timestep), which the prior has to have under `torch.func.vmap`. Every start has a damping of its own (Nielsen 1999).
 
-    Every start has a damping of its own (Nielsen 1999): the step -(J^T J + lambda I)^-1 J^T r is taken where it lowers
-    the energy, and lambda follows the ratio of the gain to that of the quadratic model. Steps are at most 0.5 long,
-    radii keep within what views have. The quadratic model wants a start near the bottom, so `gamma` is 0 here; with the
-    paper's 0.3 the far ends need some ten steps more.
+    Steps are at most 0.5 long, radii keep within what views have. The quadratic model wants a start near the bottom, so
+    `gamma` is 0 here; with the paper's 0.3 the far ends need some ten steps more.
     """
 
     def __init__(

@@ -1,9 +1,5 @@
 """ID-Pose (Cheng et al. 2023): candidates are probed, the best descend a little, the very best far.
 
-1. `explore`: a grid of candidates for each image is probed, the better half descends, is probed again, some are kept.
-2. `select`: of each image the candidate of least energy; among several images by triangles of them.
-3. `refine`: the selected poses descend together, one image at a time.
-
 Published code: `estimate_poses` and `find_optimal_poses` of github.com/xt4d/id-pose.
 """
 
@@ -41,10 +37,8 @@ class IDPose(Solver):
     `timestep` (a share of the prior's range); the answer is the mean of an image's last `averaged` poses.
 
     A `Solution` has the kept candidates as its N: the chosen one refined, the others as explored; the energies are
-    those of the candidates before refinement, by which it was chosen.
-
-    The published code reads the raw weights of a checkpoint (`prior.weights=raw`), and its rates are for Zero123's
-    energy: plain gradient descent diverges where rate times curvature passes 2.
+    those before refinement. The published code reads the raw weights of a checkpoint (`prior.weights=raw`), and its
+    rates are for Zero123's energy: plain gradient descent diverges where rate times curvature passes 2.
     """
 
     def __init__(
@@ -122,10 +116,7 @@ class IDPose(Solver):
     @torch.inference_mode(False)
     @torch.no_grad()
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
-        """See `Solver.solve_views`: candidates for each pair with the first image, selected and refined together.
-
-        The energies are those of the chosen candidates before refinement.
-        """
+        """See `Solver.solve_views`: selected and refined together; energies are those of the chosen candidates before."""
         check_starts(view_sets, starts)
         began = now(starts.device)
         sets, views = view_sets.views.shape
@@ -149,8 +140,6 @@ class IDPose(Solver):
             cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
         )
 
-    # ------------------------------------------------------------ 1. exploration
-
     def explore(self, energy: PairEnergy, starts: Tensor) -> tuple[Tensor, Tensor]:
         """The trajectories `[B, K, steps, 3]` of the K best candidates, best first, and their probed energies `[B, K]`
         (NaN where the prior failed): the better half of all is led a little downhill and probed again."""
@@ -173,15 +162,11 @@ class IDPose(Solver):
         best = _order(probed)[:, : self.kept]
         return _take(trajectory, best), probed.gather(1, best)
 
-    # ------------------------------------------------------------ 2. selection
-
     def energies_between(
         self, energy: PairEnergy, view_sets: ViewSets, poses: Tensor, duos: Sequence[tuple[int, int]]
     ) -> Tensor:
-        """Probed energies `[S, P, K, K]` of the relative poses that candidates `[S, V - 1, K, 3]` of P duos imply.
-
-        A duo is two of the other images, numbered from 0.
-        """
+        """Probed energies `[S, P, K, K]` of the relative poses that candidates `[S, V - 1, K, 3]` imply for P duos of
+        the other images, numbered from 0."""
         sets, _, count, _ = poses.shape
         if not duos:
             return poses.new_empty(sets, 0, count, count)
@@ -194,13 +179,9 @@ class IDPose(Solver):
         energy.passes += probe.passes
         return energies.view(sets, len(duos), count, count)
 
-    # ------------------------------------------------------------ 3. refinement
-
     def refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, selected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step.
-
-        The answers `[S, V - 1, 3]`, whether they are sound `[S]`, and the trajectories `[S, steps + 1, V - 1, 3]`.
-        """
+        """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step: the
+        answers `[S, V - 1, 3]`, whether they are sound `[S]`, and the trajectories `[S, steps + 1, V - 1, 3]`."""
         others, keys = selected.shape[1], on_cpu(ids)
         cycle = [pair for duo in combinations(range(others + 1), 2) for pair in (duo, duo[::-1])]  # (source, target)
         moved = self._moved(cycle, keys, energy.seed, others).to(ids.device)  # [steps, S, V]
@@ -234,10 +215,7 @@ class IDPose(Solver):
         return one_hot(moved, others + 1).bool()
 
     def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
-        """Denoising errors `[B, N]` of images `target` from `source` (`[B]` each) under poses `[B, N, 3]`.
-
-        All N meet the same noise `[B, *latent_shape]`.
-        """
+        """Denoising errors `[B, N]` of images `target` from `source` (`[B]`) under poses `[B, N, 3]`, one noise for N."""
         count = poses.shape[1]
         energy.passes += poses.shape[0] * count
         errors = self.prior.denoising_error(
@@ -253,10 +231,9 @@ class IDPose(Solver):
 def triangular_choice(alone: Tensor, between: Tensor, duos: Sequence[tuple[int, int]]) -> Tensor:
     """ID-Pose's selection among candidates for all other images of a set together: index `[S, V - 1]` of K each.
 
-    `alone` `[S, V - 1, K]` are the candidates' energies with the first image, `between` `[S, P, K, K]` those of the
-    relative poses which the candidates of the P `duos` imply for their two images. A candidate collects from every
-    duo of its image the least sum of both own energies and the one between, but at most three times its own: another
-    image without a good candidate shall not count against it. With no duos its own energy decides.
+    `alone` `[S, V - 1, K]` are the candidates' energies with the first image, `between` `[S, P, K, K]` those within
+    the P `duos`. A candidate collects from every duo of its image the least sum of both own energies and the one
+    between, but at most three times its own, lest an image without a good candidate count against it.
     """
     alone, between = (each.nan_to_num(nan=torch.inf) for each in (alone, between))
     if not duos:

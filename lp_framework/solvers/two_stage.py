@@ -21,9 +21,8 @@ from lp_framework.solvers.twist import ChooseBy, DescentSettings, TanhRadius, Tw
 class TwoStage(Solver):
     """The paper's method: `langevin` on a score or energy model, then iFusion's descent of the prior from its ends.
 
-    Defaults are the paper's (appendix, Two Stage Optimization); the second stage's settings are those of `ifusion`. It
-    takes radii over by `TanhRadius`, since the first stage may end at any. The answer is the start of least
-    second-stage energy. Without refinement steps it is the first stage alone.
+    Defaults are the paper's (appendix, Two Stage Optimization); the second stage's settings are those of `ifusion`, but
+    radii go by `TanhRadius`, since the first stage may end at any. Without refinement steps it is the first stage alone.
     """
 
     def __init__(
@@ -60,9 +59,9 @@ class TwoStage(Solver):
 
 
 def in_a_row(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
-    """The solution of `second`, which is given the ends of `first` `[B, N, 3]`, with trajectory and cost of both.
+    """The solution of `second` from the ends of `first` `[B, N, 3]`, with trajectory and cost of both.
 
-    Energies and choice are the second's. A start is invalid where either failed; where the first did, it stays there.
+    A start is invalid where either failed; where the first did, it stays there.
     """
     # A start that failed goes along at the origin, so that the others stay in their places.
     after = second(first.poses.masked_fill(~first.valid[..., None], 0.0))
