@@ -196,7 +196,7 @@ def evaluation() -> tuple[Evaluation, PairData]:
     evaluation.gather_for(data.table)
     with torch.no_grad():
         evaluation.test_step(data[data.table.pairs()], 0)
-    evaluation.result()
+    evaluation.metrics.compute()
     return evaluation, data
 
 

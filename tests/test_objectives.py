@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
+from lp_framework import registry
 from lp_framework.errors import UserError
 from lp_framework.models.objectives import TURN, NoisedPose, PoseKernel
 from lp_framework.models.pose_model import HIGH, LOW
@@ -123,13 +124,17 @@ def test_noise_depends_on_the_generator_alone(noise):
     assert not torch.equal(first, other)
 
 
+def score(**settings):
+    return registry.build("model", {"name": "score", **settings}, backbone=torch.nn.Identity())
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: PoseKernel("perodic"), "target='perodic' is not known.*did you mean 'periodic'"),
+        (lambda: score(target="perodic"), "target=perodic .* did you mean 'periodic'"),
         (lambda: PoseKernel("line", 0.0), "sigma must be above 0, got 0.0"),
         (lambda: PoseKernel("line", math.nan), "sigma must be above 0, got nan"),
-        (lambda: NoisedPose("gauss", 1.0, LOW, HIGH), "noise='gauss' is not known.*did you mean 'gaussian'"),
+        (lambda: score(noise="gauss"), "noise=gauss .* did you mean 'gaussian'"),
         (lambda: NoisedPose("uniform", 1.0, LOW[:2], HIGH), "three numbers each"),
         (lambda: NoisedPose("uniform", 1.0, LOW, LOW), "every low below its high"),
     ],

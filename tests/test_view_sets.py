@@ -110,7 +110,7 @@ def test_a_solver_is_asked_for_sets_and_its_answers_come_back_image_by_image(dat
     rows = evaluation.metrics.rows()
     for (_, other), answer in zip(rows["pair"].tolist(), rows["answer"].tolist(), strict=True):
         assert answer == [other] * 3
-    result = evaluation.result()
+    result = evaluation.metrics.compute()
     assert result["pairs"] == 2 * 2 * TEST_VIEWS
     assert result["seconds_per_pair"] == pytest.approx(0.05)
     assert result["network_passes_per_pair"] == pytest.approx(0.5)

@@ -93,7 +93,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
 
 def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
     """Whether the prior's landscapes of so many pairs take little time, by what the evaluation's own passes took."""
-    cost = evaluation.result()
+    cost = evaluation.metrics.compute()
     seconds, before = (cost["pairs"] * cost[f"{what}_per_pair"] for what in ("seconds", "network_passes"))
     latitude, longitude = landscape_grid()
     passes = 2 * pairs * len(draws.steps()) * len(latitude) * len(longitude)  # both directions

@@ -87,7 +87,7 @@ def run(config: DictConfig) -> None:
     trainer.test(evaluation, datamodule=data, verbose=False)
     evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather
     result = {
-        **evaluation.result(),
+        **evaluation.metrics.compute(),
         "protocol": protocol if views is None else "view_sets",
         "seed": seed,
         "checkpoint": subject["checkpoint"],

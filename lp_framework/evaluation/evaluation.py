@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from lightning import LightningModule
 from torch import Tensor
@@ -29,12 +27,11 @@ from lp_framework.solvers.starts import Starts
 class Evaluation(LightningModule):
     """Runs a solver under `Trainer.test` with a `PairDataModule`, so on any number of devices and processes.
 
-    Afterwards `result` gives the metrics (see `PoseMetrics`), `metrics.rows()` a row a pair. With a `journal` every
-    batch is kept as it comes, and batches that the journal has from an earlier run are not solved again.
+    Afterwards `metrics.compute()` gives the metrics, `metrics.rows()` a row a pair. With a `journal` every batch is
+    kept as it comes, and batches that the journal has from an earlier run are not solved again.
 
-    With `views` it is of `solve_views` on sets of so many images, with the batches of
-    `PairDataModule.evaluate_on_sets`. Metrics and rows are those of pairs: the first image of a set is the reference of
-    each of its others, whose pose relative to it is judged. A set has one answer, so SR equals R.
+    With `views` it is of `solve_views` on the sets of so many images of `PairDataModule.evaluate_on_sets`. Judged are
+    the pairs of a set's first image, as reference, with its others. A set has one answer, so SR equals R.
     """
 
     table: ViewTable
@@ -116,18 +113,12 @@ class Evaluation(LightningModule):
         if self.journal is not None:
             self.journal.append(solved, self.global_rank)
 
-    def result(self) -> dict[str, Any]:
-        """See `PoseMetrics.compute`."""
-        metrics: dict[str, Any] = self.metrics.compute()
-        return metrics
-
 
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
-    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera against its true one, float64
-    on the CPU.
+    """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera, float64 on the CPU.
 
     Full cameras are taken at the scale that suits each best (the paper's Details of Baseline Settings). A start that is
-    not valid has no error but NaN, which the metrics count as a failure.
+    not valid has NaN, which the metrics count as a failure.
     """
     reference, query = batch.reference.cpu(), batch.query.cpu()
     true = batch.cameras[query][:, None]

@@ -34,10 +34,7 @@ MOVABLE = ("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "train
 
 
 class Journal:
-    """The journal of the run in `folder`, of an evaluation that `subject` describes: names and numbers, nested.
-
-    An evaluation goes on only where its subject is that of before, and so is the data's fingerprint.
-    """
+    """The journal of the run in `folder`, of an evaluation that `subject` describes: names and numbers, nested."""
 
     def __init__(self, folder: Path, subject: Mapping[str, Any]) -> None:
         self.folder, self.run, self.subject = folder / FOLDER, folder, dict(subject)
@@ -45,7 +42,7 @@ class Journal:
     def begin(self, views: str) -> list[SolvedBatch]:
         """What has been solved before, if anything; else the journal is begun. `views` is the data's fingerprint.
 
-        Raises `UserError` for a journal of another evaluation. Results of a finished one are made anew.
+        Raises `UserError` for a journal of another evaluation. Results of a finished one are removed.
         """
         now = {**self.subject, "views": views}
         if goes_on(self.run, now):
@@ -73,8 +70,8 @@ class Journal:
             os.fsync(file.fileno())
 
     def finish(self) -> None:
-        """Remove the journal, of an evaluation whose results are written."""
-        shutil.rmtree(self.folder, ignore_errors=True)  # beside results it counts for nothing
+        """Remove the journal; beside results it counts for nothing."""
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _read(self) -> Iterator[SolvedBatch]:
         for file in sorted(self.folder.glob("rank_*.jsonl")):
@@ -107,7 +104,7 @@ def unfinished(folder: Path) -> dict[str, Any] | None:
 
 
 def goes_on(folder: Path, subject: Mapping[str, Any]) -> bool:
-    """Whether there is an unfinished evaluation in `folder` and it is of this subject, or part of a subject.
+    """Whether the unfinished evaluation in `folder` is of this subject, or part of one; False where there is none.
 
     Raises `UserError` for another one that has solved anything.
     """
@@ -128,10 +125,7 @@ def goes_on(folder: Path, subject: Mapping[str, Any]) -> bool:
 
 
 def compared_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of an `eval` by dotted keys, without those on which its results do not depend.
-
-    The checkpoint is left out as well: which file is meant by a path, or by none, is to be compared.
-    """
+    """The settings of an `eval` by dotted keys on which its results depend, without the checkpoint's path."""
     left_out = {"plugins", "resume", "checkpoint", *MOVABLE}
     return {key: value for key, value in dotted(config).items() if key not in left_out}
 

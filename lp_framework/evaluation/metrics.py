@@ -58,8 +58,7 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
 
 
 class PoseMetrics(HostMetric):
-    """Gathers a row a pair; `compute` gives the metrics overall, over objects with a unique answer, per object, and
-    per ambiguity class.
+    """Gathers a row a pair.
 
     `names`, `ambiguities` and `unique_answer` describe the objects by index; `unique_answer` is None where unknown.
     A solver with `one_answer` a pair has no success rates over starts.
@@ -76,7 +75,7 @@ class PoseMetrics(HostMetric):
         one_answer: bool = False,
     ) -> None:
         super().__init__()
-        self.names, self.ambiguities, self.unique_answer = list(names), list(ambiguities), list(unique_answer)
+        self.names, self.ambiguities, self.unique_answer = names, ambiguities, unique_answer
         self.one_answer = one_answer
         for state in (*STATES, "batch", "cost"):
             self.add_state(state, [], dist_reduce_fx="cat")
@@ -95,9 +94,8 @@ class PoseMetrics(HostMetric):
         return self._rows
 
     def compute(self) -> dict[str, Any]:
-        """`metrics`, `metrics_unique_answer` (None where no object is labelled so), `per_object`, `per_ambiguity`,
-        `unanswered` (the share of pairs for which the solver had no answer), `pairs`, `seconds_per_pair` and
-        `network_passes_per_pair`."""
+        """The metrics of all pairs, of objects with a unique answer (None where there are none), by object and by
+        ambiguity class; `unanswered`, the share of pairs without an answer; the number of pairs and the cost of one."""
         # Here, and only here, torchmetrics has the states of all processes together.
         gathered = {state: dim_zero_cat(getattr(self, state)) for state in STATES}
         order = first_of_each(gathered["pair"])

@@ -62,9 +62,8 @@ def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object
 def summary_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, float]]]:
     """The rows of the summary: all objects, those with a unique answer, each ambiguity class; empty ones left out."""
     rows = [("all objects", result["metrics"]), ("unique answer", result["metrics_unique_answer"])]
-    rows += [
-        (f"  {name}", metrics) for name, metrics in result["per_ambiguity"].items() if len(result["per_ambiguity"]) > 1
-    ]
+    if len(result["per_ambiguity"]) > 1:
+        rows += [(f"  {name}", metrics) for name, metrics in result["per_ambiguity"].items()]
     return [(name, metrics) for name, metrics in rows if metrics is not None]
 
 
@@ -89,17 +88,11 @@ def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) 
 
 
 def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, table: ViewTable) -> None:
-    """`results.csv` (a row an object and summary row), `pairs.csv` (a row a pair) and `results.json` in `folder`.
-
-    The last one is written last: where it is, the evaluation is finished.
-    """
+    """`results.csv` (a row an object and summary row), `pairs.csv` (a row a pair) and, last, `results.json`."""
     rows = [*summary_rows(result), *((name, row) for name, row in result["per_object"].items() if row is not None)]
     keys = [*COLUMNS, *ERRORS]
-    write_csv(
-        folder / "results.csv",
-        ["name", *keys],
-        [[name.strip(), *(round(row[key], 5) if key in row else "" for key in keys)] for name, row in rows],
-    )
+    lines = [[name.strip(), *(round(row[key], 5) if key in row else "" for key in keys)] for name, row in rows]
+    write_csv(folder / "results.csv", ["name", *keys], lines)
     write_csv(folder / "pairs.csv", PAIR_COLUMNS, pair_rows(metrics, table))
     write_json(folder / RESULT, result)
 

@@ -21,6 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lp_framework import registry
+from lp_framework.data.object_folders import written_folder
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import RECIPE, TrainedModule
@@ -33,14 +34,8 @@ CONFIG, WEIGHTS = "model.json", "model.safetensors"
 ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
 
 
-# ---------------------------------------------------------------- reading and writing
-
-
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint of this framework, as tensors, numbers and text only; `UserError` for others.
-
-    `path` is a file that training wrote, or the safetensors of a model's folder.
-    """
+    """The contents of a file that training wrote, or of a model's folder by its safetensors; `UserError` for others."""
     if path.name == WEIGHTS:
         return _read_folder(path.parent)
     try:
@@ -48,9 +43,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such checkpoint") from None
     except Exception as error:  # a damaged pickle fails in any way
-        raise UserError(
-            f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
-        ) from error
+        message = f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
+        raise UserError(message) from error
     weights = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     if (
         not isinstance(weights, dict)
@@ -92,40 +86,26 @@ def _is_recipe(value: Any) -> bool:
 
 
 def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtype: torch.dtype) -> None:
-    """Write a checkpoint (see `read_checkpoint`) of the run in `run`, floating-point weights as `dtype`.
-
-    Whole or not at all; `UserError` where the new folder cannot be written.
-    """
-    partial = folder.with_name(f"{folder.name}.partial")
+    """Write a checkpoint of the run in `run`, floating-point weights as `dtype`, whole or not at all (`UserError`)."""
     weights = {
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous()
         for key, tensor in checkpoint["state_dict"].items()
     }
     config = {**checkpoint[RECIPE], "trunk": checkpoint.get("trunk")}
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
+    with written_folder(folder) as partial:
         save_file(weights, partial / WEIGHTS)
         (partial / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
         for name in ORIGIN:
             if (run / name).is_file():
                 shutil.copyfile(run / name, partial / name)
-        partial.rename(folder)
-    except (OSError, SafetensorError) as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise UserError(f"{folder}: cannot be written: {error}") from error
-
-
-# ---------------------------------------------------------------- which one is meant
 
 
 def find_checkpoint(name: str | Path) -> Path:
     """The file of weights that `checkpoint=` means.
 
-    `name` is that of weights that ship (`score`), `latest` (the latest training run below the working directory), a
-    checkpoint file, a run's folder (its best, else its last checkpoint), a folder that `lp convert` wrote, or the id of
-    such a folder on the Hugging Face hub. Raises `UserError` where there is none.
-    """
+    `name` is that of weights that ship (`score`), `latest` (see `latest_checkpoint`), a checkpoint file, a run's folder
+    (its best, else its last checkpoint), a folder that `lp convert` wrote, or the id of such a folder on the Hugging
+    Face hub. Raises `UserError` where there is none."""
     if not isinstance(name, str | Path):
         raise UserError(f"checkpoint={name}: give bundled weights by name (score), a file, a run's folder, or {LATEST}")
     if name in [folder.name for folder in SHIPPED.iterdir()]:
@@ -159,10 +139,7 @@ def _from_hub(name: str) -> Path:
 
 
 def latest_checkpoint(runs: str | Path = "runs/train") -> Path:
-    """The latest training run's pose model below the working directory; `UserError` where there is none.
-
-    Runs of priors are passed over, and those that diverged.
-    """
+    """The pose model of the latest training run that did not diverge; `UserError` where there is none."""
     found = sorted(Path(runs).glob(f"*/{FOLDER}/{LAST}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in found:
         best = _in_folder(file.parents[1])
@@ -181,10 +158,7 @@ def describe(checkpoint: Path) -> str:
 
 
 def load_model(path: str | Path) -> PoseModel:
-    """The pose model of a checkpoint file or a run's folder, ready for use.
-
-    Raises `UserError` naming the file when it is missing, damaged, or its weights do not fit the model it names.
-    """
+    """The pose model that `find_checkpoint` finds, ready for use; `UserError` naming the file that is at fault."""
     file = find_checkpoint(path)
     model = restore(file, read_checkpoint(file))
     if not isinstance(model, PoseModel):
@@ -205,7 +179,7 @@ def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
     except Exception as error:  # constructors fail in any way at values that a file may hold
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        reason = f"{type(error).__name__}: {one_line(error)}"
         raise UserError(f"{file}: describes no model that can be built ({reason})") from error
     try:
         model.load_state_dict(checkpoint["state_dict"])

@@ -1,10 +1,8 @@
 """A second, linear readout of the features that shows training the way to the relative pose. Ours, not the paper's.
 
-The score objective is a sum over pairs of noised poses around relative longitudes; starting from features in which
-the longitude is not yet apparent its gradient all but vanishes (the optimum of a network that ignores the longitude is
-a saddle), and training stays there for long. This readout maps a view's features to a complex number u, a latitude and
-a radius, and asks that a pair's differences be right: u_q conj(u_r) = exp(i dlongitude). Where an object's longitude
-starts is left to the network, so no object gets a parameter of its own. `model.view_loss=0` is the paper's objective.
+Where the features do not tell the longitude yet, the score objective has a saddle and training stays there for long.
+This readout maps a view's features to a complex number u, a latitude and a radius, and asks that a pair's differences
+be right: u_q conj(u_r) = exp(i dlongitude). `model.view_loss=0` is the paper's objective.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ class IDPose(Solver):
     @torch.inference_mode(False)
     @torch.no_grad()
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
-        """See `Solver.solve_views`: selected and refined together; energies are those of the chosen candidates before."""
+        """See `Solver.solve_views`: chosen and refined together; the energies are those of the chosen candidates."""
         check_starts(view_sets, starts)
         began = now(starts.device)
         sets, views = view_sets.views.shape
@@ -215,7 +215,7 @@ class IDPose(Solver):
         return one_hot(moved, others + 1).bool()
 
     def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
-        """Denoising errors `[B, N]` of images `target` from `source` (`[B]`) under poses `[B, N, 3]`, one noise for N."""
+        """Denoising errors `[B, N]` of images `target` from `source`, `[B]`, under poses `[B, N, 3]`, a noise a row."""
         count = poses.shape[1]
         energy.passes += poses.shape[0] * count
         errors = self.prior.denoising_error(

@@ -21,8 +21,8 @@ from lp_framework.solvers.twist import ChooseBy, DescentSettings, TanhRadius, Tw
 class TwoStage(Solver):
     """The paper's method: `langevin` on a score or energy model, then iFusion's descent of the prior from its ends.
 
-    Defaults are the paper's (appendix, Two Stage Optimization); the second stage's settings are those of `ifusion`, but
-    radii go by `TanhRadius`, since the first stage may end at any. Without refinement steps it is the first stage alone.
+    Defaults are the paper's (appendix, Two Stage Optimization); the second stage's settings are those of `ifusion`, its
+    radii go by `TanhRadius`, since the first may end at any. Without refinement steps it is the first stage alone.
     """
 
     def __init__(
