@@ -20,7 +20,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 Dtype = Literal["float32", "bfloat16", "float16"]
 Attention = Literal["sdpa", "math"]
 
-# Configs in the words of diffusers' and transformers' config.json, and the tensors of each network by their names.
+# In the words of diffusers' and transformers' config.json.
 Configs = Mapping[str, Mapping[str, Any]]
 Weights = Mapping[str, Mapping[str, StoredTensor]]
 
@@ -136,10 +136,7 @@ def choose_attention(unet: Any, kernel: Attention) -> None:
 
 
 def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> Networks:
-    """The networks with these weights: built without memory, then given one tensor after another.
-
-    `origin` names the weights in errors. Raises `UserError` for missing, unknown and misshapen tensors.
-    """
+    """The networks with these weights, whose `origin` a `UserError` for unfit sizes or tensors names."""
     try:
         with torch.device("meta"):
             networks = Networks(configs)
@@ -157,9 +154,9 @@ def _load(origin: str, network: nn.Module, weights: Mapping[str, StoredTensor], 
     expected = network.state_dict()
     missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
     if missing or unknown:
-        reasons = [f"{len(names)} {kind} (such as '{names[0]}')" for kind, names in
-                   (("missing", missing), ("unknown", unknown)) if names]  # fmt: skip
-        raise UserError(f"{origin}: its tensors are not those of Zero123: {' and '.join(reasons)}")
+        kinds = (("missing", missing), ("unknown", unknown))
+        reasons = " and ".join(f"{len(names)} {kind} (such as '{names[0]}')" for kind, names in kinds if names)
+        raise UserError(f"{origin}: its tensors are not those of Zero123: {reasons}")
     tensors = {}
     for name, stored in weights.items():
         tensor = stored.map()

@@ -29,13 +29,36 @@ LEFT_OVER = re.compile(
     r"betas|(sqrt_|log_)?(one_minus_|recip_|recipm1_)?alphas_cumprod(_prev)?|posterior_\w+|logvar|scale_factor|"
     r"lvlb_weights|model_ema\..*|cond_stage_model\.(?!model\.visual\.).*|first_stage_model\.loss\..*"
 )
+# Each network has a table from the training code's modules to diffusers', which `renamed` applies; inverted, it leads
+# back. Modules that have the same name in both are in no table.
+RESNET = {
+    **{"in_layers.0": "norm1", "in_layers.2": "conv1", "emb_layers.1": "time_emb_proj"},
+    **{"out_layers.0": "norm2", "out_layers.3": "conv2", "skip_connection": "conv_shortcut"},
+}
+UNET_ENDS = {
+    **{"time_embed.0": "time_embedding.linear_1", "time_embed.2": "time_embedding.linear_2"},
+    **{"input_blocks.0.0": "conv_in", "out.0": "conv_norm_out", "out.2": "conv_out"},
+}
+VAE_MIDDLE = {
+    **{"mid.block_1": "mid_block.resnets.0", "mid.block_2": "mid_block.resnets.1"},
+    **{f"mid.attn_1.{each}": f"mid_block.attentions.0.to_{each}" for each in "qkv"},
+    "mid.attn_1.norm": "mid_block.attentions.0.group_norm",
+    "mid.attn_1.proj_out": "mid_block.attentions.0.to_out.0",
+}
+CLIP_ENDS = {
+    **{"class_embedding": "embeddings.class_embedding", "conv1": "embeddings.patch_embedding"},
+    "positional_embedding": "embeddings.position_embedding.weight",
+    **{"ln_pre": "pre_layrnorm", "ln_post": "post_layernorm"},  # sic
+}
+CLIP_LAYER = {
+    **{"ln_1": "layer_norm1", "attn": "self_attn", "ln_2": "layer_norm2"},
+    **{"mlp.c_fc": "mlp.fc1", "mlp.c_proj": "mlp.fc2"},
+}
 
 
 def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
-    """Sizes and tensors of the four networks; `weights` chooses the U-Net's moving averages or the raw ones.
-
-    Raises `UserError` for a file that cannot be read, or that is not a checkpoint of Zero123.
-    """
+    """Sizes and tensors of the four networks, of the U-Net's moving averages or its raw weights; `UserError` for a file
+    that is no checkpoint of Zero123."""
     tensors = read_state_dict(path)
     for key in tensors:
         if not key.startswith((UNET, VAE, VISUAL, PROJECTION)) and not LEFT_OVER.fullmatch(key):
@@ -120,46 +143,9 @@ def _clip_tensors(clip: Tensors) -> dict[str, StoredTensor]:
     return tensors
 
 
-# ---------------------------------------------------------------- names
-
-# Each network has a table from the training code's modules to diffusers', which `renamed` applies; inverted, it leads
-# back. Modules that have the same name in both are in no table.
-
-RESNET = {
-    **{"in_layers.0": "norm1", "in_layers.2": "conv1", "emb_layers.1": "time_emb_proj"},
-    **{"out_layers.0": "norm2", "out_layers.3": "conv2", "skip_connection": "conv_shortcut"},
-}
-UNET_ENDS = {
-    **{"time_embed.0": "time_embedding.linear_1", "time_embed.2": "time_embedding.linear_2"},
-    **{"input_blocks.0.0": "conv_in", "out.0": "conv_norm_out", "out.2": "conv_out"},
-}
-VAE_MIDDLE = {
-    **{"mid.block_1": "mid_block.resnets.0", "mid.block_2": "mid_block.resnets.1"},
-    **{f"mid.attn_1.{each}": f"mid_block.attentions.0.to_{each}" for each in "qkv"},
-    **{
-        "mid.attn_1.norm": "mid_block.attentions.0.group_norm",
-        "mid.attn_1.proj_out": "mid_block.attentions.0.to_out.0",
-    },
-}
-CLIP_ENDS = {
-    "class_embedding": "embeddings.class_embedding",
-    "positional_embedding": "embeddings.position_embedding.weight",
-    "conv1": "embeddings.patch_embedding",
-    "ln_pre": "pre_layrnorm",  # sic
-    "ln_post": "post_layernorm",
-}
-CLIP_LAYER = {
-    **{"ln_1": "layer_norm1", "attn": "self_attn", "ln_2": "layer_norm2"},
-    **{"mlp.c_fc": "mlp.fc1", "mlp.c_proj": "mlp.fc2"},
-}
-
-
 def unet_modules(config: Mapping[str, Any]) -> dict[str, str]:
-    """The U-Net's, whose blocks the training code numbers through all levels.
-
-    A level of the way down has its residual blocks and a downsampling; of the way up one residual block more, and the
-    upsampling inside the last one.
-    """
+    """The U-Net's, whose blocks the training code numbers through all levels: of the way down a level's residual
+    blocks and a downsampling, of the way up one residual block more, and the upsampling inside the last one."""
     names, layers = dict(UNET_ENDS), config["layers_per_block"]
 
     def resnet(original: str, ours: str) -> None:

@@ -31,8 +31,7 @@ _Result = TypeVar("_Result")
 def conditioning_vector(pose: Tensor) -> Tensor:
     """T = [-dlatitude, sin dlongitude, cos dlongitude, dradius] `[..., 4]` of relative poses `[..., 3]`.
 
-    Zero123 (section 3.2) counts the polar angle down from the pole, so its first entry is minus the difference of
-    latitudes; iFusion's (theta, azimuth, distance) has theta = -latitude.
+    Zero123 (section 3.2) counts the polar angle down from the pole, hence the sign of the first entry.
 
     >>> conditioning_vector(torch.tensor([0.2, 0.0, -0.5]))
     tensor([-0.2000,  0.0000,  1.0000, -0.5000])
@@ -72,11 +71,8 @@ class Chunks:
 
 
 class EnergyAndSlope(torch.autograd.Function):
-    """Energies `[B]` of poses `[B, 3]` whose gradient is computed at once, chunk by chunk.
-
-    Each energy depends on its own pose alone, so its gradient is a row `[3]`, kept in the place of the network's
-    activations; `both` computes the two of a chunk. Differentiable once; for more use the residual.
-    """
+    """Energies `[B]` of poses `[B, 3]`, each of its own pose alone, whose gradients `both` computes with them, chunk by
+    chunk; they are kept in the place of the network's activations. Differentiable once; for more use the residual."""
 
     @staticmethod
     def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
@@ -96,9 +92,7 @@ class EnergyAndSlope(torch.autograd.Function):
 
 
 class Zero123Prior(Prior):
-    """Zero123's four networks, in whatever dtype they are, ready for use; `Zero123` and `Zero123XL` load them.
-
-    Poses, their projection and energies are float32 in any case.
+    """Zero123's four networks, in whatever dtype; poses, their projection and energies are float32 in any case.
 
     - `channels_last`, `compile`: memory layout of the U-Net, and `torch.compile` of it (slow at the first call).
     - `cuda_graph`: on a GPU, the energy and its gradient are recorded once for each size of a batch and then replayed,
@@ -143,8 +137,7 @@ class Zero123Prior(Prior):
         self.num_timesteps = len(self.alphas_cumprod)
 
     def _apply(self, function: Any, recurse: bool = True) -> Any:
-        """Whatever moves or converts a module passes here."""
-        self.replayed.forget()
+        self.replayed.forget()  # whatever moves or converts a module passes here
         return super()._apply(function, recurse)
 
     @torch.no_grad()
@@ -212,12 +205,10 @@ class Zero123Prior(Prior):
     def _energy(
         self, pose: Tensor, target: Tensor, source: Tensor, embedding: Tensor, timestep: Tensor, noise: Tensor
     ) -> Tensor:
-        """Of a chunk, of the targets' and the sources' latents."""
         codes = ViewCode(target, embedding), ViewCode(source, embedding)  # a target's embedding is not read
         return self._residual(*codes, pose, timestep, noise).square().flatten(1).mean(dim=1)
 
     def _energy_and_slope(self, pose: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and its gradient in the poses."""
         with torch.enable_grad():
             pose = pose.detach().requires_grad_()
             energies = self._energy(pose, *others)
@@ -260,8 +251,7 @@ class Zero123Prior(Prior):
 class Zero123(Zero123Prior):
     """Zero123: `path` is its checkpoint (105000.ckpt), a folder in diffusers' layout, or a Hugging Face id.
 
-    Without a `path` it is `PUBLISHED`. `weights` chooses the moving averages (as iFusion) or the raw weights (as
-    ID-Pose) of a checkpoint file.
+    `weights` chooses the moving averages (as iFusion) or the raw weights (as ID-Pose) of a checkpoint file.
     """
 
     PUBLISHED = "kxic/zero123-105000"  # a Hugging Face id

@@ -1,14 +1,11 @@
 """Tensors in files of PyTorch and safetensors, mapped one at a time; nothing that a file says is ever run.
 
 The libraries' own readers map a whole file, and each page that a tensor was copied from stays in memory until the last
-tensor is done. A mapping of its own for each tensor ends with it: the peak of memory is then about the weights that are
-kept, a sixth of what whole mappings take of a checkpoint with moving averages and optimizer states.
+tensor is done. With a mapping for each tensor the peak is about the weights that are kept.
 
-A file of `torch.save` is a zip archive: a pickle that describes the contents, and the bytes of each tensor as a record.
 Published checkpoints mention classes of their training code, callbacks of PyTorch Lightning above all, which
 `torch.load(weights_only=True)` refuses, and without that argument unpickling runs whatever a file names. The unpickler
-here knows tensors and plain containers, and makes objects of an empty class of the training code's; a name from
-anywhere else is refused.
+here knows tensors and plain containers, and makes empty objects of the training code's; any other name is refused.
 """
 
 from __future__ import annotations
@@ -95,10 +92,8 @@ def read_safetensors(path: Path) -> dict[str, StoredTensor]:
 
 
 def read_state_dict(path: Path) -> dict[str, StoredTensor]:
-    """The tensors of a checkpoint's `state_dict`, or of a file that is nothing but one, by name.
-
-    Raises `UserError` for a file that is missing, not of `torch.save`, damaged, or that would run code when unpickled.
-    """
+    """The tensors of a checkpoint's `state_dict`, or of a file that is nothing but one, by name; `UserError` for a file
+    that is missing, not of `torch.save`, damaged, or that would run code when unpickled."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as file:
             contents = _Unpickler(path, archive, file).load()
@@ -107,9 +102,8 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from error
     except zipfile.BadZipFile as error:
-        raise UserError(
-            f"{path}: is no PyTorch checkpoint (a zip archive that torch.save wrote), or is cut short or damaged"
-        ) from error
+        message = f"{path}: is no PyTorch checkpoint (a zip archive that torch.save wrote), or is cut short or damaged"
+        raise UserError(message) from error
     except Exception as error:  # a damaged pickle fails in any way
         raise UserError(f"{path}: its description of the tensors is damaged; download it again") from error
     if isinstance(contents, Mapping) and isinstance(contents.get("state_dict"), Mapping):
@@ -144,7 +138,7 @@ class _StandIn:
 class _Unpickler(pickle.Unpickler):
     """Reads `NAME/data.pkl` of an archive, where each storage is a record `NAME/data/KEY`.
 
-    It knows tensors and dicts; `find_class`, by which alone a pickle reaches code, looks nothing up.
+    `find_class`, by which alone a pickle reaches code, looks nothing up.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, file: BinaryIO) -> None:
@@ -178,9 +172,7 @@ class _Unpickler(pickle.Unpickler):
             raise UserError(f"{self.path}: is cut short or damaged; download it again")
         return _Storage(start, info.file_size, dtype)
 
-    def _tensor(
-        self, storage: _Storage, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *rest: Any
-    ) -> StoredTensor:
+    def _tensor(self, storage: _Storage, offset: int, shape: Any, stride: Any, *rest: Any) -> StoredTensor:
         """Stands for `torch._utils._rebuild_tensor_v2`; `rest` is requires_grad, hooks and metadata."""
         skipped = offset * storage.dtype.itemsize
         tensor = StoredTensor(self.path, storage.start + skipped, storage.dtype, tuple(shape), tuple(stride))

@@ -33,11 +33,8 @@ HUB_ID = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*")
 
 
 def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dtype) -> Networks:
-    """The networks of an original checkpoint file, of a folder in diffusers' layout, or of a hub id `owner/name`.
-
-    `weights` chooses between a checkpoint's moving averages and its raw weights; a folder holds one of them, chosen
-    when it was made. Raises `UserError` where the weights cannot be had or do not fit.
-    """
+    """The networks of an original checkpoint file, of a folder in diffusers' layout, or of a hub id `owner/name`;
+    `UserError` where the weights cannot be had or do not fit."""
     packages()
     place = Path(path)
     if not place.exists() and HUB_ID.fullmatch(path) and place.suffix not in (".ckpt", ".pt", ".pth"):
@@ -56,12 +53,15 @@ def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dty
 def download(hub_id: str, revision: str | None) -> Path:
     """The local folder of a hub repository: of each network its config and the best file of its weights.
 
-    Without an answer, what has been downloaded before is used. Raises `UserError` where there is none.
+    Without an answer, what has been downloaded before is used; `UserError` where there is none.
     """
     from huggingface_hub import HfApi, snapshot_download
 
     try:
-        needed = _needed(HfApi().list_repo_files(hub_id, revision=revision))
+        names, needed = HfApi().list_repo_files(hub_id, revision=revision), []
+        for part in (*PARTS, *PROJECTIONS):
+            best = [f"{part}/{name}" for name in WEIGHT_FILES if f"{part}/{name}" in names]
+            needed += [f"{part}/config.json", *best[:1]]
         folder = snapshot_download(hub_id, revision=revision, allow_patterns=needed)
     except Exception as error:  # each HTTP library that the hub's package has used tells it its own way
         try:
@@ -73,15 +73,6 @@ def download(hub_id: str, revision: str | None) -> Path:
                 "give prior.path= a checkpoint file or a folder that you have"
             ) from error
     return Path(folder)
-
-
-def _needed(names: list[str]) -> list[str]:
-    """Of a repository's files those that loading reads."""
-    needed = []
-    for part in (*PARTS, *PROJECTIONS):
-        best = [f"{part}/{name}" for name in WEIGHT_FILES if f"{part}/{name}" in names]
-        needed += [f"{part}/config.json", *best[:1]]
-    return needed
 
 
 def read_folder(path: Path) -> tuple[Configs, Weights]:
@@ -109,10 +100,7 @@ def _vae_name(name: str) -> str:
 
 
 def write_folder(networks: Networks, path: Path) -> None:
-    """Write the networks as safetensors in diffusers' layout (`cc_projection`), whole or not at all.
-
-    Raises `UserError` where that cannot be, as where the folder exists and is not empty.
-    """
+    """Write the networks as safetensors in diffusers' layout (`cc_projection`), whole or not at all (`UserError`)."""
     projection = networks.cc_projection
     sizes = {"in_channel": projection.in_features, "out_channel": projection.out_features}
     tensors = {f"projection.{name}": tensor for name, tensor in projection.state_dict().items()}
