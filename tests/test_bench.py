@@ -45,12 +45,11 @@ from lp_framework.geometry import wrap_angle
 from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.gauss_newton import GaussNewton
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.twist import IFusion
-from lp_framework.solvers.two_stage import TwoStage
+from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
 CPU = torch.device("cpu")
 

@@ -17,10 +17,9 @@ from lp_framework.errors import UserError
 from lp_framework.priors.base import ViewCode
 from lp_framework.priors.zero123.prior import Zero123
 from lp_framework.solvers.base import Pairs
-from lp_framework.solvers.gauss_newton import GaussNewton
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
-from lp_framework.solvers.two_stage import TwoStage
+from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
 
 class Flat(ExactPrior):
@@ -250,7 +249,7 @@ def test_no_step_waits_for_the_device_or_mixes_devices(monkeypatch):
     meta = torch.device("meta")
     pairs, true = exact_pairs(2)
     there = Pairs(*(each.to(meta) for each in vars(pairs).values()))
-    monkeypatch.setattr("lp_framework.solvers.gauss_newton.check_starts", lambda pairs, starts: None)  # looks at values
+    monkeypatch.setattr("lp_framework.solvers.two_stage.check_starts", lambda pairs, starts: None)  # looks at values
     solution = GaussNewton(ExactModel(), ExactPrior().to(meta)).refine(there, around(true, 0.3).to(meta), seed=0)
     assert solution.poses.device == meta and solution.poses.shape == (2, 1, 3)
     with pytest.raises(RuntimeError, match="device"):

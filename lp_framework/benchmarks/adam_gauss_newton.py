@@ -14,11 +14,10 @@ from lp_framework.data.pairs import PairData
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution, pairs_of
-from lp_framework.solvers.gauss_newton import GaussNewton
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
-from lp_framework.solvers.two_stage import TwoStage
+from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
 CONTENDERS = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
 # What both are judged by: the energy under timesteps and noises that neither descends.

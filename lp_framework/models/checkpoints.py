@@ -22,6 +22,7 @@ from safetensors.torch import save_file
 
 from lp_framework import registry
 from lp_framework.data.object_folders import written_folder
+from lp_framework.data.reading import read_json
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import RECIPE, TrainedModule
@@ -57,12 +58,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def _read_folder(folder: Path) -> dict[str, Any]:
     """The checkpoint that a folder holds, weights in float32; `UserError` naming the file that is at fault."""
-    try:
-        config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-        if not _is_recipe(config):
-            raise ValueError("model and backbone have no names")
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{folder / CONFIG}: is not the description of a trained model ({error})") from error
+    config = read_json(folder / CONFIG)
+    if not _is_recipe(config):
+        raise UserError(
+            f"{folder / CONFIG}: is not the description of a trained model, with names of model and backbone"
+        )
     try:
         with safe_open(folder / WEIGHTS, framework="pt") as file:
             weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)

@@ -1,7 +1,4 @@
-"""The pose network: features of two images and a noised pose in, a score or an energy out.
-
-Paper, appendix "Model Architecture and Hyperparameters".
-"""
+"""The pose network (paper, appendix "Model Architecture and Hyperparameters")."""
 
 from __future__ import annotations
 
@@ -31,11 +28,11 @@ class PoseEmbedding(nn.Module):
 
 
 class ResidualLayer(nn.Module):
-    """x + relu(norm(W x)), width unchanged."""
+    """x + activation(norm(W x)), width unchanged."""
 
-    def __init__(self, width: int, dropout: float) -> None:
+    def __init__(self, width: int, *activation: nn.Module) -> None:
         super().__init__()
-        self.layers = nn.Sequential(nn.Linear(width, width), nn.LayerNorm(width), nn.ReLU(), nn.Dropout(dropout))
+        self.layers = nn.Sequential(nn.Linear(width, width), nn.LayerNorm(width), *activation)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.layers(x)
@@ -56,7 +53,8 @@ class PoseNetwork(nn.Module):
         self.reference = nn.Linear(feature_dim, hidden)
         self.query = nn.Linear(feature_dim, hidden, bias=False)
         self.pose = nn.Linear(self.embedding.dim, hidden, bias=False)
-        self.residual = nn.Sequential(*(ResidualLayer(hidden, dropout) for _ in range(layers)))
+        residual = [ResidualLayer(hidden, nn.ReLU(), nn.Dropout(dropout)) for _ in range(layers)]
+        self.residual = nn.Sequential(*residual)
         self.output = nn.Linear(hidden, outputs)
 
     def project(self, reference: Tensor, query: Tensor) -> Tensor:

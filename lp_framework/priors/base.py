@@ -16,7 +16,7 @@ from lp_framework.errors import UserError
 class ViewCode:
     """All that a prior keeps of B images: `latent` `[B, C, h, w]` and `embedding` `[B, tokens, channels]`.
 
-    Indexing is that of a batch: `code[2:5]`, `code[index]` with integers `[N]` of images, repeated ones too.
+    Indexing is that of a batch: `code[2:5]`, `code[index]` with integers `[N]`.
     """
 
     latent: Tensor
@@ -27,10 +27,6 @@ class ViewCode:
 
     def __getitem__(self, index: slice | Tensor) -> ViewCode:
         return ViewCode(self.latent[index], self.embedding[index])
-
-    def to(self, device: torch.device | str) -> ViewCode:
-        """The same on another device."""
-        return ViewCode(self.latent.to(device), self.embedding.to(device))
 
 
 class Prior(nn.Module, ABC):
@@ -83,17 +79,11 @@ class Prior(nn.Module, ABC):
 
     def check(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> None:
         """`UserError` where the arguments of `residual` do not fit each other."""
-        batch = len(pose)
-        wanted = {
-            "target": (tuple(target.latent.shape), (batch, *self.latent_shape)),
-            "source": (tuple(source.latent.shape), (batch, *self.latent_shape)),
-            "pose": (tuple(pose.shape), (batch, 3)),
-            "timestep": (tuple(timestep.shape), (batch,)),
-            "noise": (tuple(noise.shape), (batch, *self.latent_shape)),
-        }
-        for name, (shape, right) in wanted.items():
-            if shape != right:
-                raise UserError(f"{name} must be {list(right)} for {batch} poses, got {list(shape)}")
+        batch, latents = len(pose), {"target": target.latent, "source": source.latent, "noise": noise}
+        for name, tensor in {**latents, "pose": pose, "timestep": timestep}.items():
+            wanted = [batch, *(self.latent_shape if name in latents else (3,) if name == "pose" else ())]
+            if list(tensor.shape) != wanted:
+                raise UserError(f"{name} must be {wanted} for {batch} poses, got {list(tensor.shape)}")
         known = timestep.device.type == "cpu"  # looking at the values on a GPU would wait for it, at every step
         outside = batch and known and not 0 <= timestep.min() <= timestep.max() < self.num_timesteps
         if timestep.is_floating_point() or outside:

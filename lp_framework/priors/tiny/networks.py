@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lp_framework.models.networks import ResidualLayer
 from lp_framework.models.view_head import scaled
 from lp_framework.priors.base import resized
 
@@ -137,17 +138,6 @@ def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
     return torch.cat([constant.expand(*moved.shape[:-1], -1), turned.flatten(-3), moved], dim=-1)
 
 
-class Residual(nn.Module):
-    """x + silu(norm(W x)); smooth, because solvers differentiate it."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(width, width), nn.LayerNorm(width), nn.SiLU())
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.layers(x)
-
-
 class TinyNetworks(nn.Module):
     """All that is trained (and the latents' basis). `predict` is the model: p(target's latents | source, pose)."""
 
@@ -159,7 +149,9 @@ class TinyNetworks(nn.Module):
         last = nn.Linear(width, 2 * latent_dim)
         nn.init.zeros_(last.weight[latent_dim:])
         nn.init.constant_(last.bias[latent_dim:], math.log(0.3 * scale))
-        self.head = nn.Sequential(nn.Linear(code_dim(orders), width), *(Residual(width) for _ in range(layers)), last)
+        first = nn.Linear(code_dim(orders), width)
+        hidden = [ResidualLayer(width, nn.SiLU()) for _ in range(layers)]  # smooth, since solvers differentiate it
+        self.head = nn.Sequential(first, *hidden, last)
         self.decoder = ImageDecoder(latent_dim)
 
     def predict(self, code: Tensor, pose: Tensor) -> Gaussian:

@@ -81,7 +81,9 @@ def read_folder(path: Path) -> tuple[Configs, Weights]:
     if projection is None:
         raise UserError(f"{path}: holds no pose projection, a folder {' or '.join(PROJECTIONS)}")
     weights = {part: _weights(path / part) for part in PARTS}
-    weights["vae"] = {_vae_name(name): stored for name, stored in weights["vae"].items()}
+    old = re.compile(rf"(\.attentions\..*\.)({'|'.join(OLD_VAE_NAMES)})(?=\.\w+$)")
+    vae = weights["vae"].items()
+    weights["vae"] = {old.sub(lambda found: found[1] + OLD_VAE_NAMES[found[2]], name): each for name, each in vae}
     weights["cc_projection"] = {name.partition(".")[2]: stored for name, stored in _weights(projection).items()}
     return {part: read_json(path / part / "config.json") for part in PARTS}, weights
 
@@ -92,11 +94,6 @@ def _weights(folder: Path) -> dict[str, StoredTensor]:
         raise UserError(f"{folder}: holds no weights, none of {', '.join(WEIGHT_FILES)}")
     tensors = read_state_dict(file) if file.suffix == ".bin" else read_safetensors(file)
     return {name: stored for name, stored in tensors.items() if name not in LEFT_OVER}
-
-
-def _vae_name(name: str) -> str:
-    pattern = rf"(?<=\.)({'|'.join(OLD_VAE_NAMES)})(?=\.\w+$)"
-    return re.sub(pattern, lambda match: OLD_VAE_NAMES[match[1]], name) if ".attentions." in name else name
 
 
 def write_folder(networks: Networks, path: Path) -> None:
