@@ -49,21 +49,16 @@ class Evaluation(LightningModule):
         """The objects are known once the data are prepared."""
         data: PairDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.gather_for(data.table(data.evaluation_split()))
-        if self.journal is not None:
-            self._go_on(self.journal, data)
-
-    def _go_on(self, journal: Journal, data: PairDataModule) -> None:
-        """Take up what an earlier run has solved. One process reads it, lest others meet what this run has added."""
-        found: list[SolvedBatch] | UserError | None = None
-        if self.trainer.is_global_zero:
+        found: list[SolvedBatch] | UserError = []
+        # One process reads what an earlier run has solved, lest others meet what this run has added.
+        if self.journal is not None and self.trainer.is_global_zero:
             try:
-                found = journal.begin(data.fingerprint(data.evaluation_split()))
+                found = self.journal.begin(data.fingerprint(data.evaluation_split()))
             except UserError as error:
                 found = error
         found = self.trainer.strategy.broadcast(found)
         if isinstance(found, UserError):
             raise found if self.trainer.is_global_zero else SystemExit(1)  # said once
-        assert found is not None
         if not found:
             return
         pairs = torch.cat([batch.pair for batch in found])

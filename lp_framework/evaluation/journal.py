@@ -40,10 +40,8 @@ class Journal:
         self.folder, self.run, self.subject = folder / FOLDER, folder, dict(subject)
 
     def begin(self, views: str) -> list[SolvedBatch]:
-        """What has been solved before, if anything; else the journal is begun. `views` is the data's fingerprint.
-
-        Raises `UserError` for a journal of another evaluation. Results of a finished one are removed.
-        """
+        """What has been solved before, of data with the fingerprint `views`; else the journal is begun and the results
+        of a finished evaluation are removed. `UserError` for a journal of another one."""
         now = {**self.subject, "views": views}
         if goes_on(self.run, now):
             return list(self._read())
@@ -55,10 +53,8 @@ class Journal:
 
     def append(self, batch: SolvedBatch, rank: int) -> None:
         """Keep a batch that the process of this rank has solved; it is on disk when this returns."""
-        values = {
-            name: value.tolist() if isinstance(value, torch.Tensor) else value
-            for name, value in batch._asdict().items()
-        }
+        fields = batch._asdict().items()
+        values = {name: each.tolist() if isinstance(each, torch.Tensor) else each for name, each in fields}
         text = json.dumps(values, separators=(",", ":")).encode()
         line = b"%08x %s\n" % (zlib.crc32(text), text)
         with (self.folder / f"rank_{rank}.jsonl").open("ab+") as file:
@@ -104,10 +100,8 @@ def unfinished(folder: Path) -> dict[str, Any] | None:
 
 
 def goes_on(folder: Path, subject: Mapping[str, Any]) -> bool:
-    """Whether the unfinished evaluation in `folder` is of this subject, or part of one; False where there is none.
-
-    Raises `UserError` for another one that has solved anything.
-    """
+    """Whether the unfinished evaluation in `folder` is of this subject, or part of one; False where there is none,
+    `UserError` for another one that has solved anything."""
     before = unfinished(folder)
     if before is None:
         return False
@@ -161,4 +155,4 @@ def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str,
 
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
     others = {key: value for key, value in subject.items() if key not in ("config", "versions")}
-    return {**compared_settings(subject["config"]), **others}
+    return compared_settings(subject["config"]) | others

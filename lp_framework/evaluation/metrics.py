@@ -58,11 +58,8 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
 
 
 class PoseMetrics(HostMetric):
-    """Gathers a row a pair.
-
-    `names`, `ambiguities` and `unique_answer` describe the objects by index; `unique_answer` is None where unknown.
-    A solver with `one_answer` a pair has no success rates over starts.
-    """
+    """Gathers a row a pair. `names`, `ambiguities` and `unique_answer` (None: unknown) describe the objects by index; a
+    solver with `one_answer` a pair has no success rates over starts."""
 
     batch: list[Tensor]  # the first pair of each
     cost: list[Tensor]  # pairs, seconds, passes of each batch

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 class PoseEmbedding(nn.Module):
     """Sines and cosines of a relative pose `[..., 3]` at doubling frequencies: `[..., 6 * frequencies]`.
 
-    With `periodic` the lowest frequency of the longitude is one a turn, so that 0 and 2 pi are embedded alike; the
-    paper's target on the line tells them apart, so there it is half a turn (and a quarter for room beyond the ends).
+    With `periodic` longitudes 0 and 2 pi are embedded alike; the paper's target on the line tells them apart.
     """
 
     frequencies: Tensor
@@ -41,8 +40,7 @@ class ResidualLayer(nn.Module):
 class PoseNetwork(nn.Module):
     """Residual MLP on (reference features, query features, embedded pose): `[..., outputs]`.
 
-    The first layer is a linear map of the concatenated input, kept as one map an input: an image's part is computed
-    once (`project`) and shared by all pairs, noised poses and solver steps that meet the image.
+    The first layer is kept as one linear map an input, so that an image's part is computed once (`project`).
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Denoising score matching of the relative pose: the perturbation kernel, the noised pose and the two targets.
 
-Paper: Eq. (3) (score objective), appendix "Energy-based Modeling" and "Closed-Form Expression" (targets),
-"Theoretical Justification" (what the distribution of the noised pose changes).
+Paper: Eq. (3), appendix "Energy-based Modeling", "Closed-Form Expression" and "Theoretical Justification".
 """
 
 from __future__ import annotations
@@ -61,8 +60,7 @@ class NoisedPose:
     """How the noised pose is drawn for training.
 
     `uniform` over a box (the paper's choice): the optimum is the mean of the kernel's scores over all answers
-    (Lemma 1). `gaussian` around the truth: the optimum weighs the answers by their posterior (Proposition 1), so two
-    answers stay two. With a unique answer both have the same optimum (Lemma 2).
+    (Lemma 1). `gaussian` around the truth: the optimum weighs the answers by their posterior (Proposition 1).
     """
 
     def __init__(self, noise: str, sigma: float, low: Sequence[float], high: Sequence[float]) -> None:

@@ -23,10 +23,8 @@ def scaled(pose: Tensor) -> Tensor:
 
 
 def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
-    """Mean squared error of the relative pose over the batch's pairs, a scalar.
-
-    `readout` `[I, 4]` of the views: real and imaginary part of the longitude's phase, scaled latitude and radius.
-    """
+    """Mean squared error of the batch's relative poses, a scalar, by the `readout` `[I, 4]` of its views: real and
+    imaginary part of the longitude's phase, scaled latitude and radius."""
     readout, true = readout.float(), batch.relative_poses()  # complex numbers have no bfloat16
     phase = torch.complex(readout[:, 0], readout[:, 1])
     turn = phase[batch.query] * phase[batch.reference].conj()

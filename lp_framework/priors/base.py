@@ -48,8 +48,7 @@ class Prior(nn.Module, ABC):
         """Predicted minus true noise, `[B, *latent_shape]` float32; differentiable in `pose`, forward and backward.
 
         The prediction is for `target` (B codes) noised by `noise` `[B, *latent_shape]` to `timestep` `[B]` (int64),
-        seen from `source` (B codes) under the relative pose `[B, 3]` of the target.
-        """
+        seen from `source` (B codes) under the relative pose `[B, 3]` of the target."""
 
     def denoising_error(
         self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor

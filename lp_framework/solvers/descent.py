@@ -91,9 +91,8 @@ def descend(
 ) -> Descended:
     """Lower `energy(pose_of(parameters), step)` by so many steps from parameters `[B, N, D]`.
 
-    `pose_of` gives poses `[B, N, P]`, `energy` `[B, N]`. The plateau is fed with the sum of the energies so far, as
-    iFusion does. A start whose energy or gradient is not finite stops: it goes back to the last pose where they were,
-    stays there, and is no longer valid. The others do not notice.
+    The plateau is fed with the sum of the energies so far, as iFusion does. A start whose energy or gradient is not
+    finite stops at the last pose where they were, and is no longer valid.
     """
     valid = torch.ones_like(optimizer.rate, dtype=torch.bool)
     total = torch.zeros_like(optimizer.rate)

@@ -112,10 +112,8 @@ class Matches(NamedTuple):
 
 
 class Sift:
-    """SIFT of OpenCV (Lowe 2004) within the object, matched where nearest both ways and clearly nearer than the next.
-
-    `ratio` is the largest share that the distance of the nearest descriptor may be of the second nearest's.
-    """
+    """SIFT of OpenCV (Lowe 2004) within the object, matched where nearest both ways, at `ratio` times the distance of
+    the second nearest or less."""
 
     network = None
 

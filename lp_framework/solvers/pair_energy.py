@@ -17,10 +17,8 @@ _NOISE = 0x4E4F  # separates the prior's noise from a solver's other draws under
 
 
 def keyed_noise(prior: Prior, device: torch.device, *keys: Tensor | int) -> Tensor:
-    """Standard normal noise `[..., *latent_shape]` (float32) for integer keys that broadcast to `[...]`.
-
-    Keys on the CPU make it without waiting for what the device has to do.
-    """
+    """Standard normal noise `[..., *latent_shape]` (float32) for integer keys (on the CPU, lest the device be waited
+    for) that broadcast to `[...]`."""
     draws = keyed_normal(_NOISE, *keys, count=math.prod(prior.latent_shape))
     return to_device(draws.float().unflatten(-1, prior.latent_shape), device)
 
@@ -29,8 +27,8 @@ class PairEnergy:
     """The prior's denoising error of relative poses, the mean over both directions, for B pairs at once.
 
     Direction 0 predicts the query from the reference under the pose x; direction 1 the reference from the query under
-    -x. The images are encoded on construction, each once, without gradients, unless their codes are given. `passes`
-    counts the samples that have gone through the network: encoded images, and two a pose and call.
+    -x. The images are encoded on construction, unless their codes are given. `passes` counts the samples that have gone
+    through the network: encoded images, and two a pose and call.
     """
 
     def __init__(self, prior: Prior, pairs: Pairs, seed: int, codes: ViewCode | None = None) -> None:
@@ -63,10 +61,8 @@ class PairEnergy:
         return errors.unflatten(0, (*poses.shape[:2], 2)).mean(dim=-1)
 
     def residual(self, poses: Tensor, timestep: int, noise: Tensor) -> Tensor:
-        """Predicted minus true noise `[B, N, 2, elements of a latent]`, whose mean square is the energy.
-
-        Differentiable in the poses `[B, N, 3]`, forward and backward; noise is `[B, 2, *latent_shape]`.
-        """
+        """Predicted minus true noise `[B, N, 2, elements of a latent]`, whose mean square is the energy; differentiable
+        in the poses `[B, N, 3]`, forward and backward."""
         residual = self.prior.residual(*self._samples(poses, timestep, noise))
         return residual.flatten(1).unflatten(0, (*poses.shape[:2], 2))
 

@@ -1,9 +1,8 @@
 """Absolute view poses from relative poses of pairs, some of them grossly wrong.
 
-The paper's "global optimization to obtain a consistent set of absolute poses" (Joint Reasoning across Multiple Views).
-Latitude and radius are linear; longitudes live on a circle, which makes the fit non-convex. It is started from several
-sets of longitudes, each descended by iteratively reweighted least squares on the Geman-McClure cost r^2 / (r^2 + c^2),
-whose scale c shrinks to its final value on the way (graduated non-convexity), and the one that ends lowest is kept.
+The paper's "global optimization to obtain a consistent set of absolute poses" (Joint Reasoning across Multiple Views),
+from several sets of longitudes by iteratively reweighted least squares on the Geman-McClure cost r^2 / (r^2 + c^2),
+whose scale c shrinks to its final value on the way (graduated non-convexity); the one that ends lowest is kept.
 """
 
 from __future__ import annotations
@@ -22,15 +21,12 @@ ROUNDS = 30
 
 @torch.no_grad()
 def fit_views(measured: Tensor, weights: Tensor) -> Tensor:
-    """Poses `[S, V, 3]` of V images relative to their first (which is 0), for S sets; longitudes in [0, 2 pi).
-
-    They are computed, and come back, in float64 on the CPU.
+    """Poses `[S, V, 3]` of V images relative to their first (0), float64 on the CPU; longitudes in [0, 2 pi).
 
     `measured[s, i, j, k]` is the k-th of K measurements of the pose of image j relative to i (longitude on any turn),
-    `[S, V, V, K, 3]`; `weights` `[S, V, V, K]`, not negative, say how much each counts. Several measurements of a pair
-    may contradict each other, and the rest of the set decides between them. What is not finite counts nothing, and
-    so does the diagonal. Two images have the mean of what is measured in both directions, as long as it agrees to
-    about `SCALE`, else one of the two.
+    `[S, V, V, K, 3]`; `weights` `[S, V, V, K]`, not negative, say how much each counts. What is not finite counts
+    nothing, and so does the diagonal. Two images have the mean of what is measured in both directions, as long as it
+    agrees to about `SCALE`, else one of the two.
     """
     measured, weights = measured.cpu(), weights.cpu()
     diagonal = torch.eye(measured.shape[1], dtype=torch.bool)[..., None]
@@ -51,8 +47,7 @@ def fit_views(measured: Tensor, weights: Tensor) -> Tensor:
 
 def _synchronised(measured: Tensor, weights: Tensor) -> Tensor:
     """Longitudes `[S, V]` by angular synchronisation (Singer 2011): the phases of the leading eigenvector of the
-    Hermitian matrix of exp(i (longitude_i - longitude_j)); uses all measurements at once.
-    """
+    Hermitian matrix of exp(i (longitude_i - longitude_j))."""
     phases = torch.polar(weights, -measured[..., 1]).sum(dim=-1)
     return torch.linalg.eigh(phases + phases.mH).eigenvectors[..., -1].angle()
 

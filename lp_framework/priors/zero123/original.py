@@ -1,8 +1,7 @@
 """Checkpoints of the published training code (latent-diffusion): sizes from the tensors, tensors by diffusers' names.
 
-Its layout: `model.diffusion_model` is the U-Net and `model_ema` the moving averages of it, `first_stage_model` the
-autoencoder, `cond_stage_model` OpenAI's CLIP (of which Zero123 uses the image half), `cc_projection` the projection of
-embedding and pose.
+`model.diffusion_model` is the U-Net and `model_ema` its moving averages, `first_stage_model` the autoencoder,
+`cond_stage_model` OpenAI's CLIP, of which Zero123 uses the image half.
 """
 
 from __future__ import annotations

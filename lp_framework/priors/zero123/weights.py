@@ -1,8 +1,7 @@
 """Where Zero123's weights come from: a checkpoint of the training code, a diffusers folder, the Hugging Face hub.
 
-A folder in diffusers' layout has a subfolder a network, each with a config.json and the weights. Two layouts of Zero123
-are in circulation. They differ in the name of the pose projection and of its tensors: `cc_projection`
-(`projection.weight`) and `clip_camera_projection` (`proj.weight`).
+Published folders name the pose projection and its tensors in two ways: `cc_projection` (`projection.weight`) and
+`clip_camera_projection` (`proj.weight`).
 """
 
 from __future__ import annotations
