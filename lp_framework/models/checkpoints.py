@@ -60,9 +60,7 @@ def _read_folder(folder: Path) -> dict[str, Any]:
     """The checkpoint that a folder holds, weights in float32; `UserError` naming the file that is at fault."""
     config = read_json(folder / CONFIG)
     if not _is_recipe(config):
-        raise UserError(
-            f"{folder / CONFIG}: is not the description of a trained model, with names of model and backbone"
-        )
+        raise UserError(f"{folder / CONFIG}: is not the description of a trained model and its backbone")
     try:
         with safe_open(folder / WEIGHTS, framework="pt") as file:
             weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)

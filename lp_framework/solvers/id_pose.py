@@ -109,7 +109,7 @@ class IDPose(Solver):
             energies=energies,
             valid=valid,
             chosen=chosen,
-            cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
+            cost=Cost(energy.passes, now(starts.device) - began),
             trajectory=trajectory,
         )
 

@@ -24,18 +24,8 @@ def shrink(images: Tensor) -> Tensor:
 
 
 def _halve(pixels: Tensor) -> Tensor:
-    """Pixels `[B, 3 * 64 * 64]` averaged over 2 x 2: `[B, 3 * 32 * 32]`."""
+    """Pixels `[B, 3 * 32 * 32]` of `[B, 3 * 64 * 64]`."""
     return functional.avg_pool2d(pixels.view(-1, 3, IMAGE_SIZE, IMAGE_SIZE), 2).flatten(1)
-
-
-def principal_components(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues `[K]`, falling, and eigenvectors `[D, K]` of rows^T rows, for `rows` `[N, D]`; K = min(N, D)."""
-    if len(rows) >= rows.shape[1]:
-        values, vectors = torch.linalg.eigh(rows.T @ rows)
-    else:  # those of the smaller product, mapped over
-        values, vectors = torch.linalg.eigh(rows @ rows.T)
-        vectors = functional.normalize(rows.T @ vectors, dim=0)
-    return values.flip(0), vectors.flip(1)
 
 
 class PrincipalLatents(nn.Module):
@@ -58,13 +48,16 @@ class PrincipalLatents(nn.Module):
 
     @torch.no_grad()
     def fit(self, pixels: Tensor) -> None:
-        """Take the basis from pixels `[I, 3 * 64 * 64]`; with fewer images than `dim` the rest of it is zero.
-
-        It is computed in float64, so on the CPU.
-        """
+        """Take the basis from pixels `[I, 3 * 64 * 64]`; with fewer images than `dim` the rest of it is zero."""
         small = _halve(pixels.float()).cpu().double()
         mean = small.mean(dim=0)
-        variances, vectors = principal_components((small - mean) / len(small) ** 0.5)
+        rows = (small - mean) / len(small) ** 0.5
+        if len(rows) >= rows.shape[1]:
+            variances, vectors = torch.linalg.eigh(rows.T @ rows)
+        else:  # those of the smaller product, mapped over
+            variances, vectors = torch.linalg.eigh(rows @ rows.T)
+            vectors = functional.normalize(rows.T @ vectors, dim=0)
+        variances, vectors = variances.flip(0), vectors.flip(1)  # from the largest to the least
         missing = max(0, self.dim - len(variances))
         variances = functional.pad(variances[: self.dim].clamp(min=0), (0, missing))
         vectors = functional.pad(vectors[:, : self.dim], (0, missing))
@@ -158,10 +151,6 @@ class TinyNetworks(nn.Module):
         """The Gaussian over the target's latents for codes `[..., code_dim]` of sources, relative poses `[..., 3]`."""
         mean, log_spread = self.head(steer(code, pose, self.orders)).chunk(2, dim=-1)
         return Gaussian(mean, log_spread)
-
-    def marginal(self) -> Gaussian:
-        """The Gaussian over latents of all training views `[latent_dim]`: what is predicted of no source."""
-        return Gaussian(torch.zeros_like(self.latents.spread), self.latents.spread.clamp(min=1e-6).log())
 
 
 def predicted_noise(noisy: Tensor, alpha: Tensor, predicted: Gaussian) -> Tensor:

@@ -186,8 +186,8 @@ class TinyPrior(Prior):
         eta: float = 1.0,
     ) -> Tensor:
         networks, alphas = self.model.networks, self.model.alphas_cumprod
-        # Without a source the prediction is the Gaussian of all training views.
-        predicted, anything = networks.predict(source.embedding[:, 0], pose.float()), networks.marginal()
+        predicted, spread = networks.predict(source.embedding[:, 0], pose.float()), networks.latents.spread
+        anything = Gaussian(torch.zeros_like(spread), spread.clamp(min=1e-6).log())  # of all training views
 
         def predict(latent: Tensor, timestep: int) -> Tensor:
             free, conditional = (predicted_noise(latent, alphas[timestep], each) for each in (anything, predicted))

@@ -42,8 +42,6 @@ def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dty
         raise UserError(f"prior.revision={revision} is for ids of the Hugging Face hub, and {path} is a file")
     if not place.is_dir():
         return assemble(path, *read_original(place, weights), dtype)
-    if not (place / "unet" / "config.json").is_file():
-        raise UserError(f"{path}: is no folder of Zero123 in diffusers' layout, it holds no unet/config.json")
     if weights == "raw":
         raise UserError(f"{path}: is a folder, which holds one set of weights; prior.weights=raw is for a .ckpt file")
     return assemble(path, *read_folder(place), dtype)
