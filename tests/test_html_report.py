@@ -39,7 +39,6 @@ from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.geometry import camera_to_world, wrap_angle
 from lp_framework.models.pose_model import FieldValue
 from lp_framework.report import page as page_module
-from lp_framework.report import run_parts
 from lp_framework.report.page import write_report_page, write_run_page
 from lp_framework.report.runs import run_folders, run_kind
 from lp_framework.solvers.starts import Ring
@@ -391,7 +390,7 @@ def test_a_run_without_pictures_has_its_tables(tmp_path):
 
 def test_examples_that_are_too_large_are_left_out_from_the_end(tmp_path, monkeypatch):
     write_evaluation(tmp_path / "run")
-    monkeypatch.setattr(run_parts, "LARGEST", 1)
+    monkeypatch.setattr(page_module, "MOST_PLOTS", 1)
     page = page_of(tmp_path / "run")
     assert "2 more would make the page too large" in page.said
     assert cards(page) == [NASTY.replace("_", " ")] and len(page.figures["map"]) == 1

@@ -15,10 +15,9 @@ from result_folders import metrics, write_job, write_result
 
 from lp_framework.errors import UserError
 from lp_framework.report.runs import checkpoint_setting, find_runs, read_run
-from lp_framework.report.sweep_figures import sweep_figure
+from lp_framework.report.sweep_figures import Curve, Panel, curves_figure, sweep_figure
 from lp_framework.report.sweep_tables import sweep_tables, varying
 from lp_framework.report.sweeps import csv_rows, layout
-from lp_framework.viz.sweeps import Curve, Panel, curves_figure
 
 RECALLS = {0: (0.80, 0.82, 0.90), 0.3: (0.90, 0.91, 0.95)}  # by gamma, of seeds 0, 1, 2
 
@@ -292,7 +291,7 @@ def test_curves_of_one_label_share_a_colour_and_nothing_is_outside_the_axes():
     x, nan = np.array([0.0, 1.0]), np.full(2, np.nan)
     ours, theirs = Curve("a", x, np.array([0.13, 0.5]), nan), Curve("a", x, np.array([0.4, 0.6]), nan, paper=True)
     other = Curve("b", x, np.array([0.7, 0.9]), np.array([0.1, 0.1]))
-    axes = curves_figure([Panel("p", "x", [ours, theirs, other])], "the paper").axes[0]
+    axes = curves_figure([Panel("p", "x", [ours, theirs, other])]).axes[0]
     first, second, third = (line for line in axes.lines if line.get_marker() not in ("_", "|"))
     assert first.get_color() == second.get_color() != third.get_color()
     assert second.get_markerfacecolor() == "white" and axes.get_ylim()[0] <= 0.13

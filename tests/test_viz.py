@@ -36,11 +36,18 @@ from lp_framework.solvers.base import Cost, Pairs, Solution, Solver
 from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.starts import Grid as GridStarts
 from lp_framework.solvers.starts import Ring
-from lp_framework.viz import errors_plot
-from lp_framework.viz.errors_plot import ObjectCard, cumulative, errors_figure, objects_figure
+from lp_framework.viz import sheets
+from lp_framework.viz.curves import (
+    Curve,
+    cumulative,
+    errors_figure,
+    read_losses,
+    save_training_picture,
+    training_figure,
+)
 from lp_framework.viz.maps import broken_at_seam, draw_map, pair_figure
+from lp_framework.viz.sheets import ObjectCard, objects_figure
 from lp_framework.viz.style import ANSWER, save_figure
-from lp_framework.viz.training import Curve, read_losses, save_training_picture, training_figure
 
 TRUTH = torch.tensor([0.3, 5.6, 0.2])
 IMAGE = np.zeros((8, 8, 3), dtype=np.uint8)
@@ -270,7 +277,7 @@ def test_objects_are_sorted_worst_first():
 
 
 def test_sheet_of_many_objects_keeps_the_worst(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(errors_plot, "MOST_OBJECTS", 9)
+    monkeypatch.setattr(sheets, "MOST_OBJECTS", 9)
     cards = [ObjectCard(f"a name of some length {i}", "unlabelled", IMAGE, i / 12, 0.0) for i in range(12)]
     figure = objects_figure(cards)
     assert len(names_on(figure)) == 9 and "the 9 worst of 12" in figure.texts[0].get_text()

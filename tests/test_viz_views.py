@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from lp_framework.viz.sheets import signed, views_figure
 from lp_framework.viz.style import TRUTH, save_figure
-from lp_framework.viz.views import signed, views_figure
 
 SOURCE = np.full((16, 16, 3), 200, dtype=np.uint8)
 

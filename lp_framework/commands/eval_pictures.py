@@ -12,8 +12,9 @@ from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examp
 from lp_framework.analysis.shown import ShownPair
 from lp_framework.data.pairs import PairData
 from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.viz.errors_plot import ObjectCard, errors_figure, objects_figure
+from lp_framework.viz.curves import errors_figure
 from lp_framework.viz.maps import pair_figure
+from lp_framework.viz.sheets import ObjectCard, objects_figure
 from lp_framework.viz.style import save_figure
 
 

@@ -43,7 +43,7 @@ from lp_framework.registry import checked
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.progress import shown_progress
-from lp_framework.viz.azimuth import azimuth_figure
+from lp_framework.viz.curves import azimuth_figure
 from lp_framework.viz.maps import minima_in_words, pair_figure, surface_figure
 from lp_framework.viz.style import save_figure
 

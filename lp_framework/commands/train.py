@@ -44,7 +44,7 @@ from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.report.page import write_run_page
-from lp_framework.viz.training import save_training_picture
+from lp_framework.viz.curves import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
 OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, without use in eval

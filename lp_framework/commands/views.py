@@ -26,8 +26,8 @@ from lp_framework.evaluation.tables import write_json
 from lp_framework.priors.base import Prior
 from lp_framework.registry import checked
 from lp_framework.solvers.progress import shown_progress
+from lp_framework.viz.sheets import views_figure
 from lp_framework.viz.style import save_figure
-from lp_framework.viz.views import views_figure
 
 FOLDER = "views"
 Source = tuple[Path, str, Image.Image]  # what is turned: its file, its name, and the prepared image (RGBA)

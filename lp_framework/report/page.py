@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import cache
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from lp_framework.evaluation.tables import write_text
-from lp_framework.report.parts import RunPart, Section, packed_text, render
-from lp_framework.report.run_parts import PARTS
-from lp_framework.report.runs import Kind
+from lp_framework.analysis.examples import EXAMPLES, read_examples
+from lp_framework.analysis.shown import words
+from lp_framework.errors import UserError
+from lp_framework.evaluation.tables import RESULT, summary_rows, write_text
+from lp_framework.report import parts, plots
+from lp_framework.report.runs import Kind, saved_config
+from lp_framework.viz.curves import read_losses
+from lp_framework.viz.style import CLASS_COLOURS
 
 PAGE = "report.html"
 LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of the runs are in the table alone
-
-
-class Listed(NamedTuple):
-    """A run on the page of a set; `content` is all of it (HTML), None where there is no room for it."""
-
-    number: int
-    folder: Path
-    heading: str
-    part: RunPart
-    content: str | None
+MOST_PLOTS = 4_000_000  # letters that the plots of one run's pairs may take; the last ones are left out beyond it
+MOST_CAMERAS = 40
+WORST = 20  # pairs in the table of the worst
+POSE = ("latitude_degrees", "longitude_degrees", "radius")
 
 
 def write_run_page(folder: Path, kind: Kind) -> Path:
@@ -36,14 +38,20 @@ def write_run_page(folder: Path, kind: Kind) -> Path:
     return write_report_page(folder / PAGE, [(folder, kind)], [])
 
 
-def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> Path:
+def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequence[parts.Section]) -> Path:
     """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened.
 
     It is written whole or not at all.
     """
-    part = _one(*runs[0], above) if len(runs) == 1 else _several(runs, above)
+    if len(runs) == 1:
+        ((folder, kind),) = runs
+        part = PARTS[kind][1](folder)
+        *sections, configuration = part.sections
+        part = part._replace(sections=[*sections, *above, configuration])
+    else:
+        part = parts.RunPart("Report", f"{len(runs)} runs", {}, [*above, *_sections_of_several(runs)])
     templates = resources.files("lp_framework.report") / "templates"
-    text = render(
+    text = parts.render(
         "page.html.j2",
         part=part,
         style=(templates / "page.css").read_text(encoding="utf-8"),
@@ -55,31 +63,201 @@ def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequ
     return path
 
 
-def _one(folder: Path, kind: Kind, above: Sequence[Section]) -> RunPart:
-    part = PARTS[kind][1](folder)
-    *sections, configuration = part.sections
-    return replace(part, sections=[*sections, *above, configuration])
-
-
-def _several(runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> RunPart:
-    listed: list[Listed] = []
-    room = LARGEST
-    for number, (folder, kind) in enumerate(runs):
-        heading, part_of = PARTS[kind]
-        part = part_of(folder)
-        content = render("run.html.j2", part=part)
-        fits = len(content) <= room
-        room -= len(content) if fits else 0
-        listed.append(Listed(number, folder, heading, part, content if fits else None))
-    sections = [*above]
-    for heading in dict.fromkeys(run.heading for run in listed):
-        some = [run for run in listed if run.heading == heading]
-        sections.append(Section(heading, render("runs.html.j2", caption=heading, runs=some)))
-    sections.append(Section("Run by run", render("opened.html.j2", runs=listed)))
-    return RunPart("Report", f"{len(runs)} runs", {}, sections)
-
-
 @cache
 def _plotly() -> str:
     """plotly.js, packed: a third of its size, so that every run of a sweep can have a page."""
-    return packed_text(get_plotlyjs())
+    return parts.packed(get_plotlyjs())
+
+
+def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> list[parts.Section]:
+    """A table for the runs of each command, and all that each of them shows, while there is room."""
+    listed: list[dict[str, Any]] = []
+    room = LARGEST
+    for number, (folder, kind) in enumerate(runs):
+        part = PARTS[kind][1](folder)
+        content = parts.render("run.html.j2", part=part)
+        fits = len(content) <= room
+        room -= len(content) if fits else 0
+        shown = content if fits else None
+        listed.append({"number": number, "folder": folder, "kind": kind, "part": part, "content": shown})
+    sections = []
+    for kind in dict.fromkeys(kind for _, kind in runs):
+        heading, some = PARTS[kind][0], [run for run in listed if run["kind"] == kind]
+        sections.append(parts.Section(heading, parts.render("runs.html.j2", caption=heading, runs=some)))
+    return [*sections, parts.Section("Run by run", parts.render("opened.html.j2", runs=listed))]
+
+
+def _evaluation(folder: Path) -> parts.RunPart:
+    sections: parts.Sections = [
+        ("Summary", "summary", lambda result: {"rows": summary_rows(result), "result": result}),
+        ("Pairs, failures first", "pairs", partial(_pairs, folder)),
+        ("Objects", "objects", lambda result: _objects(result, parts.read_rows(folder / "pairs.csv"))),
+        ("Errors", "errors", lambda _: _errors(parts.read_rows(folder / "pairs.csv"))),
+    ]
+    return parts.run_part(folder, RESULT, _about_evaluation, sections)
+
+
+def _about_evaluation(result: parts.Record) -> parts.About:
+    config, unique = result["config"], result["metrics_unique_answer"]
+    metrics, over = (result["metrics"], "all objects") if unique is None else (unique, "unique answer")
+    median = metrics["rotation_error"]
+    return (
+        f"{words(config['solver']['name'])} on {config['data']['name']}",
+        f"evaluation of {result['pairs']} pairs ({result['protocol']}), start={config['start']['name']}, "
+        f"seed {result['seed']}",
+        {
+            **{f"{name}, {over}": f"{metrics[name]:.1%}" for name in ("R@5", "R@15", "R(R)@15")},
+            f"median rotation error, {over}": "\N{INFINITY}" if median is None else f"{median:.1f}°",
+            "pairs": str(result["pairs"]),
+            "seconds a pair": f"{result['seconds_per_pair']:.3g}",
+        },
+    )
+
+
+def _pairs(folder: Path, record: parts.Record) -> dict[str, Any]:
+    """The pairs that a run keeps beside its pictures, each with its plots (packed, by kind) and the steps they show."""
+    if record.get("config", {}).get("pictures") is False:
+        raise UserError("the run was made with pictures=false")
+    examples = read_examples(folder / "pictures" / EXAMPLES)
+    shown: list[dict[str, Any]] = []
+    room = MOST_PLOTS
+    for example in examples:
+        kinds = {"map": plots.map_plot, "cameras": plots.pair_cameras_plot}
+        if example.landscapes:
+            kinds["surface"] = plots.surface_plot
+        drawn = {kind: parts.packed(draw(example)) for kind, draw in kinds.items()}
+        room -= sum(map(len, drawn.values()))
+        if shown and room < 0:
+            break
+        shown.append({"example": example, "plots": drawn, "steps": plots.frame_steps(example)})
+    return {"pairs": shown, "left_out": len(examples) - len(shown)}
+
+
+def _objects(result: parts.Record, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
+    found = {name: metrics for name, metrics in result["per_object"].items() if metrics is not None}
+    order = sorted(found, key=lambda name: (found[name]["R(R)@15"], found[name].get("SR(R)@30", 0), name))
+    return {
+        "objects": {name: found[name] for name in order},
+        "classes_of": {row["object"]: row["ambiguity"] for row in rows},
+        "counts": Counter(row["object"] for row in rows),
+    }
+
+
+def _errors(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
+    rotation = np.array([float(row["rotation_error_degrees"]) for row in rows])
+    classes = np.array([row["ambiguity"] for row in rows])
+    figure = plots.errors_plot({name: rotation[classes == name] for name in CLASS_COLOURS if name in classes})
+    order = np.argsort(-np.nan_to_num(rotation, nan=math.inf), kind="stable")[:WORST]
+    worst = [(rows[place], rotation[place], float(rows[place]["translation_error"])) for place in order]
+    return {"figure": figure, "worst": worst}
+
+
+def _training(folder: Path) -> parts.RunPart:
+    sections = [
+        ("Losses", "losses", lambda _: _losses(folder)),
+        ("Last values", "last", lambda report: {"final": report["final"]}),
+    ]
+    return parts.run_part(folder, "training.json", partial(_about_training, folder), sections)
+
+
+def _about_training(folder: Path, report: parts.Record) -> parts.About:
+    config = saved_config(folder / "config.yaml")
+    losses, _ = read_losses(folder / "metrics.csv")
+    best = {"best validation loss": f"{np.nanmin(losses['val/loss'].value):.4g}"} if "val/loss" in losses else {}
+    title = f"{words(config['model']['name'])} model, trained on {config['data']['name']}"
+    if not report:
+        return title, "training that has not finished", best
+    counts = {key: str(report[key]) for key in ("epochs", "steps")}
+    return title, f"training over {report['epochs']} epochs, seed {report['seed']}", best | counts
+
+
+def _losses(folder: Path) -> dict[str, Any]:
+    losses, rate = read_losses(folder / "metrics.csv")
+    if not losses:
+        raise UserError("no loss was logged")
+    return {"figure": plots.losses_plot(losses, rate)}
+
+
+def _estimate(folder: Path) -> parts.RunPart:
+    sections = [("Cameras", "cameras", lambda _: _cameras(folder)), ("Poses", "poses", lambda _: _poses(folder))]
+    return parts.run_part(folder, RESULT, partial(_about_estimate, folder), sections)
+
+
+def _about_estimate(folder: Path, result: parts.Record) -> parts.About:
+    rows = parts.read_rows(folder / "poses.csv")
+    found = sum(row["valid"] == "True" for row in rows)
+    return (
+        f"Cameras by {words(result['config']['solver']['name'])}",
+        "camera poses of photographs; the first is the reference",
+        {"photographs": str(len(rows)), "with a pose": str(found), "seconds": f"{result['seconds']:.3g}"},
+    )
+
+
+def _cameras(folder: Path) -> dict[str, Any]:
+    rows = [row for row in parts.read_rows(folder / "poses.csv") if row["valid"] == "True"]
+    if not rows:
+        raise UserError("no photograph has a pose")
+    shown = rows[:MOST_CAMERAS]
+    poses = np.array([[float(row[key]) for key in POSE] for row in shown])
+    poses[:, :2] = np.radians(poses[:, :2])
+    figure = plots.cameras_plot(poses, [_image(folder, row) for row in shown])
+    return {"figure": figure, "shown": len(shown), "count": len(rows)}
+
+
+def _poses(folder: Path) -> dict[str, Any]:
+    rows = parts.read_rows(folder / "poses.csv")
+    keys = [*POSE, *(f"relative_{key}" for key in POSE)]
+    poses = [[float(row[key]) for key in keys] if row["valid"] == "True" else None for row in rows]
+    images = [parts.tried(partial(_image, folder, row), None) for row in rows]
+    names = [Path(row["file"]).name for row in rows]
+    return {"rows": list(zip(names, images, poses, [row["energy"] for row in rows], strict=True))}
+
+
+def _image(folder: Path, row: Mapping[str, str]) -> NDArray:
+    """The prepared image `[S, S, 4]` of a row; only what lies in the run's own folder is read."""
+    with Image.open(folder / "images" / Path(row["image"]).name) as image:
+        return np.asarray(image.convert("RGBA"))
+
+
+def _landscape(folder: Path) -> parts.RunPart:
+    if (folder / "landscape.json").is_file():
+        sections: parts.Sections = [
+            ("Landscape", "pairs", partial(_pairs, folder)),
+            ("Pictures", "pictures", lambda _: {"files": _sheets(folder)}),
+        ]
+        return parts.run_part(folder, "landscape.json", _about_landscape, sections)
+    return parts.run_part(folder, "azimuth.json", _about_azimuths, [("Objects", "azimuths", lambda record: record)])
+
+
+def _about_landscape(record: parts.Record) -> parts.About:
+    files = " and ".join(Path(record[name]).name for name in ("reference", "query"))
+    name = record["config"]["object"]
+    numbers = {"minima": str(len(record["minima"])), "flatness along longitude": f"{record['flatness']:.2f}"}
+    answer = next((each for each in record["descents"] if each["chosen"]), None)
+    if answer is not None and answer["rotation_error"] is not None:
+        numbers["rotation error of the answer"] = f"{answer['rotation_error']:.1f}°"
+    title = f"Landscape of {files}" if name is None else f"Landscape of {words(name)}, {files}"
+    return title, "the energy of the prior over the relative pose of a pair, and the ways of a solver over it", numbers
+
+
+def _sheets(folder: Path) -> list[Path]:
+    files = [folder / f"{name}.png" for name in ("landscape", "fields") if (folder / f"{name}.png").is_file()]
+    if not files:
+        raise UserError("there is no landscape.png")
+    return files
+
+
+def _about_azimuths(record: parts.Record) -> parts.About:
+    names = {"within": "least energy within 15°, all objects", "within_unique_answer": "the same, unique answer"}
+    return (
+        f"Landscapes of {record['config']['data']['name']}, prior {record['config']['prior']['name']}",
+        "the energy of the prior around each object, all but the azimuth true",
+        {label: f"{record[key]:.1%}" for key, label in names.items() if record.get(key) is not None},
+    )
+
+
+# By the command, with the heading of its runs in a table of several.
+PARTS: Mapping[Kind, tuple[str, Callable[[Path], parts.RunPart]]] = {
+    "eval": ("Evaluations", _evaluation), "train": ("Trainings", _training),
+    "estimate": ("Estimates", _estimate), "landscape": ("Landscapes", _landscape),
+}  # fmt: skip

@@ -9,7 +9,6 @@ import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -42,8 +41,7 @@ class Section(NamedTuple):
     content: str
 
 
-@dataclass(frozen=True)
-class RunPart:
+class RunPart(NamedTuple):
     """A run on a page: what it is in a few words, its most important numbers by name, and its sections."""
 
     title: str
@@ -111,13 +109,9 @@ def _read(file: Path, parse: Callable[[str], T]) -> T:
         raise UserError(f"{file.name} is damaged ({error})") from error
 
 
-def packed(figure: go.Figure) -> str:
-    """A figure for the page's script, compressed, in letters."""
-    return packed_text(figure.to_json())
-
-
-def packed_text(text: str) -> str:
-    """Text for the page's script, compressed, in letters."""
+def packed(content: go.Figure | str) -> str:
+    """A figure or a text for the page's script, compressed, in letters."""
+    text = content if isinstance(content, str) else content.to_json()
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
 
@@ -139,21 +133,16 @@ def number(name: str, value: float) -> str:
     """A metric's value, rounded as is usual for it."""
     if not math.isfinite(value):
         return "inf"
-    if name == "network_passes_per_pair":
-        return f"{value:.0f}"
     if name == "rotation_error":
         return f"{value:.2f}" if value < 100 else f"{value:.0f}"
-    if name == "seconds_per_pair":
-        return f"{value:.3g}"
-    return f"{value:.3f}"
+    digits = {"network_passes_per_pair": ".0f", "seconds_per_pair": ".3g"}
+    return format(value, digits.get(name, ".3f"))
 
 
 def metric(metrics: Mapping[str, float | None], key: str) -> str:
     """A metric in print; a solver with one answer has no success rates, and null is infinity."""
-    if key not in metrics:
-        return "-"
-    value = metrics[key]
-    return number(key, math.inf if value is None else value)
+    value = metrics.get(key, math.nan)
+    return number(key, math.inf if value is None else value) if key in metrics else "-"
 
 
 _ENVIRONMENT = Environment(

@@ -25,9 +25,8 @@ from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz.cameras import ROUND, SPOKES, image_plane
-from lp_framework.viz.errors_plot import cumulative
+from lp_framework.viz.curves import LOSSES, Curve, cumulative, running_mean
 from lp_framework.viz.maps import RELIEF, broken_at_seam, closed
-from lp_framework.viz.training import LOSSES, Curve, running_mean
 
 INK, MUTED, LINE, SURFACE, HALO, TRUTH, ANSWER, OTHERS, REFERENCE, GREY = (
     f"var(--{name})"

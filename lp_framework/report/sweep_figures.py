@@ -1,17 +1,22 @@
-"""The figures of a sweep's table: which ones, and what goes into them."""
+"""The figures of a sweep's table: shares over a number that was swept, or combinations of settings side by side."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.report.sweep_tables import Row, Spread, SweepTable, heading, shown
-from lp_framework.viz.sweeps import COLOURS, Curve, Entry, Panel, curves_figure, entries_figure
+from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, VERMILION, open_frame, styled
 
 AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins
 RECALL, SUCCESS, ROTATION_RECALL = (
@@ -23,22 +28,41 @@ NOISE = "noise scale \u03b3 of the longitude"
 TIME = "seconds a pair (log scale)"
 SECONDS, SOLVER = "seconds_per_pair", "solver.name"
 NONE = Spread(math.nan, math.nan)
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+DASHES = (0, (3, 2))  # of the paper's curves
+
+
+class Curve(NamedTuple):
+    """Means `[K]` with standard deviations `[K]` (NaN for a single run) over `x` `[K]`; one `label`, one colour."""
+
+    label: str
+    x: NDArray
+    mean: NDArray
+    std: NDArray
+    paper: bool = False
+
+
+class Panel(NamedTuple):
+    """Curves over one axis: its label, and whether it is logarithmic."""
+
+    title: str
+    xlabel: str
+    curves: Sequence[Curve]
+    logarithmic: bool = False
 
 
 def sweep_figure(table: SweepTable) -> Figure | None:
     """What the settings that vary call for: shares over a number, or the rows beside each other; None for one row."""
-    paper = "the paper: other data, other prior"
     axis = next((key for key in AXES if is_swept(table, key)), None)
     if axis is not None and len(table.apart_from(axis)) <= len(COLOURS):
-        return curves_figure(_panels(table, axis), paper)
+        return curves_figure(_panels(table, axis))
     if len(table.rows) < 2 and table.paper is None:
         return None
-    entries: list[Entry] = []
+    rows: dict[str, Row] = {}
     for row in table.with_paper():
-        named = row.source if row.paper else label(row.settings)
-        if named not in [entry.label for entry in entries]:
-            entries.append(Entry(named, row.metrics, row.paper))
-    return entries_figure(entries, PANELS, paper)
+        rows.setdefault(row.source if row.paper else label(row.settings), row)
+    return rows_figure(rows)
 
 
 def cost_figure(table: SweepTable) -> Figure | None:
@@ -48,11 +72,66 @@ def cost_figure(table: SweepTable) -> Figure | None:
     solvers = [row.settings.get(SOLVER) for row in table.rows]
     if len(set(solvers)) < 2 or len(table.rows) > len(COLOURS) or is_swept(table, "start.count"):
         return None
-    panels = [
-        Panel(name, TIME, [_curve(_called(table, row), [row], None, name) for row in table.rows], logarithmic=True)
-        for name in ROTATION_RECALL
-    ]
-    return curves_figure(panels, "")
+    return curves_figure(
+        [
+            Panel(name, TIME, [_curve(_called(table, row), [row], None, name) for row in table.rows], logarithmic=True)
+            for name in ROTATION_RECALL
+        ]
+    )
+
+
+@styled
+def curves_figure(panels: Sequence[Panel]) -> Figure:
+    """Panels side by side on one axis of shares; the paper's curves are dashed, with hollow marks."""
+    figure, row = _side_by_side(len(panels), 3.3)
+    drawn = [curve for panel in panels for curve in panel.curves]
+    labels = list(dict.fromkeys(curve.label for curve in drawn))
+    for axes, panel in zip(row, panels, strict=True):
+        for curve in panel.curves:
+            place, theirs = labels.index(curve.label) % len(COLOURS), curve.paper
+            axes.errorbar(
+                curve.x, curve.mean, yerr=None if theirs else curve.std, color=COLOURS[place], marker=MARKERS[place],
+                markersize=4.5, markerfacecolor="white" if theirs else COLOURS[place], capsize=2, elinewidth=1.0,
+                linestyle=DASHES if theirs else "-", linewidth=1.0 if theirs else 1.5, clip_on=False,
+                zorder=2 if theirs else 3,
+            )  # fmt: skip
+        _across(axes, panel)
+        axes.set_title(panel.title)
+        open_frame(axes)
+    values = np.concatenate([[*curve.mean, *(curve.mean - np.nan_to_num(curve.std))] for curve in drawn])
+    row[0].set_ylim(_lowest(values, 0.2), 1.0)
+    row[0].set_ylabel("share of pairs")
+    _legend(figure, labels, any(curve.paper for curve in drawn), markersize=4.5, linestyle=DASHES)
+    return figure
+
+
+@styled
+def rows_figure(rows: Mapping[str, Row]) -> Figure:
+    """A line a row, from the top, by its label, in panels of metrics: a mark a metric at its share."""
+    figure, panels = _side_by_side(len(PANELS), 1.15 + 0.27 * len(rows), sharex=True)
+    drawn = []
+    for axes, (title, names) in zip(panels, PANELS.items(), strict=True):
+        for place, metric in enumerate(names):
+            for line, row in enumerate(rows.values()):
+                if metric in row.metrics:
+                    mean, std = row.metrics[metric]
+                    drawn.append(mean)
+                    axes.errorbar(
+                        mean, line, xerr=std, color=COLOURS[place], marker=MARKERS[place], markersize=5,
+                        linestyle="none", elinewidth=1.2, capsize=2, clip_on=False, zorder=3,
+                        markerfacecolor="white" if row.paper else COLOURS[place],
+                    )  # fmt: skip
+        axes.set_title(title)
+        axes.set_xlabel("share")
+        open_frame(axes)
+        axes.grid(visible=False, axis="x")
+    panels[0].set_xlim(_lowest(drawn, 0.3), 1.0)
+    panels[0].set_yticks(range(len(rows)), list(rows))
+    panels[0].set_ylim(len(rows) - 0.5, -0.5)
+    for tick, row in zip(panels[0].get_yticklabels(), rows.values(), strict=True):
+        tick.set_color(MUTED if row.paper else INK)
+    _legend(figure, WITHIN, any(row.paper for row in rows.values()), markersize=5, linestyle="none")
+    return figure
 
 
 def is_swept(table: SweepTable, key: str) -> bool:
@@ -129,3 +208,45 @@ def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Cu
     x = [row.metrics.get(SECONDS, NONE).mean if axis is None else float(row.settings[axis]) for row in rows]
     mean, std = np.array([row.metrics[metric] for row in rows]).T
     return Curve(title, np.array(x), mean, std, rows[0].paper)
+
+
+def _side_by_side(panels: int, height: float, sharex: bool = False) -> tuple[Figure, Sequence[Axes]]:
+    figure = Figure(figsize=(8.0, height))
+    figure.set_layout_engine("constrained", wspace=0.05)
+    return figure, figure.subplots(1, panels, sharex=sharex, sharey=True, squeeze=False)[0]
+
+
+def _legend(figure: Figure, labels: Sequence[str], paper: bool, markersize: float, linestyle: Any) -> None:
+    """Above the panels, in as many columns as fit: about 120 letters, and each key's mark takes the room of 9."""
+    keys = [
+        Line2D([], [], color=colour, marker=marker, label=label, markersize=markersize,
+               linestyle="none" if linestyle == "none" else "-")
+        for label, colour, marker in zip(labels, itertools.cycle(COLOURS), itertools.cycle(MARKERS), strict=False)
+    ]  # fmt: skip
+    if paper:
+        look: dict[str, Any] = {"marker": "o", "markersize": markersize, "markerfacecolor": "white"}
+        told = "the paper: other data, other prior"
+        keys.append(Line2D([], [], color=MUTED, label=told, linewidth=1.0, linestyle=linestyle, **look))
+    lengths = [len(str(key.get_label())) + 9 for key in keys]
+    columns = len(keys) if sum(lengths) <= 120 else max(1, 120 // max(lengths))
+    figure.legend(handles=keys, loc="outside upper left", ncols=columns, columnspacing=1.6)
+
+
+def _across(axes: Axes, panel: Panel) -> None:
+    """The horizontal axis: a tick for every value that was swept, or a logarithmic one."""
+    axes.set_xlabel(panel.xlabel)
+    if panel.logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(10, subs=(1.0,), numticks=8))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes.xaxis.set_major_locator(FixedLocator(sorted({float(x) for curve in panel.curves for x in curve.x})))
+        axes.xaxis.set_minor_locator(NullLocator())
+    axes.margins(x=0.08 if panel.logarithmic else 0.04)
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+
+
+def _lowest(shares: Iterable[float], room: float) -> float:
+    """Where an axis of shares begins: at a tenth, `room` tenths or more below the least of them, at most at 0.8."""
+    least = min((share for share in shares if math.isfinite(share)), default=0.0)
+    return min(0.8, max(0.0, math.floor(10 * least - room) / 10))

@@ -101,6 +101,11 @@ class Sheet:
         self.figure.legend(handles=keys, bbox_to_anchor=place, **{**layout, **spaces, **style})
 
 
+def class_keys(classes: Sequence[str], **look: Any) -> list[Line2D]:
+    """The key's entries for those ambiguity classes that are among `classes`."""
+    return [Line2D([], [], color=CLASS_COLOURS[name], label=name, **look) for name in CLASS_COLOURS if name in classes]
+
+
 def degrees(axes: Axes, which: Literal["x", "y"], step: float) -> None:
     """Ticks every `step` degrees on an axis, labelled with a degree sign."""
     axis = axes.xaxis if which == "x" else axes.yaxis

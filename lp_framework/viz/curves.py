@@ -1,0 +1,204 @@
+"""Figures of curves: errors of an evaluation, losses of a training, the energy around objects."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FixedLocator, LogLocator, NullLocator, PercentFormatter, StrMethodFormatter
+from numpy.typing import NDArray
+
+from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLD
+from lp_framework.viz import style
+from lp_framework.viz.style import CLASS_COLOURS, INK, MUTED, TRUTH, VERMILION, open_frame, styled
+
+NEAREST = 0.01  # scene units; where the logarithmic axis of translation errors begins
+DASHED: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (3, 2)), "zorder": 2}
+LOSSES = {"train/loss": (style.BLUE, "training loss"), "val/loss": (VERMILION, "validation loss"),
+          "train/view_loss": (style.GREEN, "training, view readout")}  # fmt: skip
+COLUMNS = 4  # of objects
+
+
+def cumulative(errors: NDArray, end: float) -> tuple[NDArray, NDArray]:
+    """The share of `errors` `[E]` that are at most x, as a staircase from 0 to `end`: x and share `[U]`.
+
+    Between two points the share is that of the point before (`drawstyle="steps-post"`). What is NaN is never reached.
+
+    >>> cumulative(np.array([3.0, 1.0, np.nan, 3.0]), 180.0)
+    (array([  0.,   1.,   3., 180.]), array([0.  , 0.25, 0.75, 0.75]))
+    """
+    reached, counts = np.unique(errors[np.isfinite(errors) & (errors <= end)], return_counts=True)
+    share = np.cumsum(counts) / max(1, errors.size)
+    last = share[-1] if len(share) else 0.0
+    return np.concatenate([[0.0], reached, [end]]), np.concatenate([[0.0], share, [last]])
+
+
+@styled
+def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, classes: Sequence[str]) -> Figure:
+    """Share of pairs within an error, one curve an ambiguity class.
+
+    `rotation` (degrees) and `translation` (scene units) `[P, N]`, the chosen start `[P]`, and every pair's class `[P]`.
+    Solid: the chosen start. Dashed: all starts, where there are several.
+    """
+    figure = Figure(figsize=(8.0, 3.5))
+    figure.set_layout_engine("constrained", wspace=0.06)
+    left, right = figure.subplots(1, 2, width_ratios=[1.7, 1], sharey=True)
+    several = rotation.shape[1] > 1
+    keys = []
+    for name in sorted(set(classes), key=list(CLASS_COLOURS).index):
+        rows, colour = np.array(classes) == name, CLASS_COLOURS[name]
+        for axes, errors, end in ((left, rotation, 180.0), (right, translation, 4.0)):
+            answer = np.take_along_axis(errors[rows], chosen[rows, None], axis=1)
+            stairs = {"color": colour, "drawstyle": "steps-post"}
+            axes.plot(*cumulative(answer.ravel(), end), label=name, zorder=3, **stairs)
+            if several:
+                axes.plot(*cumulative(errors[rows].ravel(), end), label=f"{name}, all starts", **stairs, **DASHED)
+        keys.append(Line2D([], [], color=colour, label=f"{name} ({rows.sum()} pairs)"))
+    if several:
+        keys.append(Line2D([], [], color=INK, label="chosen start"))
+        keys.append(Line2D([], [], color=INK, label=f"all {rotation.shape[1]} starts", **DASHED))
+    # Small errors matter most: a square-root axis gives them room and still begins at 0.
+    left.set_xscale(
+        "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * np.square(x))
+    )
+    left.set(xlim=(0, 180), ylim=(0, 1.005), xlabel="rotation error (square-root scale)")
+    left.set_ylabel("share of pairs within the error")
+    left.yaxis.set_major_formatter(PercentFormatter(1.0))
+    right.set_xscale("log")
+    right.set(xlim=(NEAREST, 4), xlabel="translation error (object sizes, log scale)")
+    for axes, thresholds, others, unit in (
+        (left, ROTATION_THRESHOLDS, (0, 60, 90, 120, 180), "°"),
+        (right, (TRANSLATION_THRESHOLD,), (0.01, 0.05, 1, 4), ""),
+    ):
+        axes.xaxis.set_major_locator(FixedLocator(sorted([*thresholds, *others])))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}" + unit))
+        open_frame(axes)
+        for threshold in thresholds:
+            axes.axvline(threshold, color=MUTED, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
+    figure.legend(handles=keys, loc="outside upper left", ncols=len(keys), columnspacing=1.6, handlelength=1.8)
+    return figure
+
+
+class Curve(NamedTuple):
+    """A logged value: `step` `[S]` and `value` `[S]`."""
+
+    step: NDArray
+    value: NDArray
+
+
+def read_losses(path: Path) -> tuple[dict[str, Curve], Curve | None]:
+    """The curves of `LOSSES`, and the learning rate, in a `metrics.csv` of Lightning's CSV logger, over its `step`.
+
+    Empty cells are left out; a file that is not there has no curves.
+    """
+    gathered: dict[str, list[tuple[float, float]]] = {}
+    if path.is_file():
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                for name, cell in row.items():
+                    if name != "step" and cell:
+                        gathered.setdefault(name, []).append((float(row["step"]), float(cell)))
+    curves = {name: Curve(*np.array(points).T) for name, points in gathered.items()}
+    rate = next((curve for name, curve in curves.items() if name.startswith("lr-")), None)
+    return {name: curves[name] for name in LOSSES if name in curves}, rate
+
+
+def save_training_picture(folder: Path) -> list[Path]:
+    """`training.png` and `.pdf` in a training run's folder, from its `metrics.csv`; none where nothing was logged."""
+    losses, rate = read_losses(folder / "metrics.csv")
+    return style.save_figure(training_figure(losses, rate), folder / "training")[:1] if losses else []
+
+
+def running_mean(values: NDArray, window: int) -> NDArray:
+    """Mean of the `window` values around each of `values` `[S]`; of fewer at the ends.
+
+    >>> running_mean(np.array([1.0, 2.0, 6.0, 4.0]), 3)
+    array([1.5, 3. , 4. , 5. ])
+    """
+    ones = np.ones(window)
+    mean: NDArray = np.convolve(values, ones, mode="same") / np.convolve(np.ones_like(values), ones, mode="same")
+    return mean
+
+
+@styled
+def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
+    """The losses by their logged names on a log scale, and below them the learning rate where there is one."""
+    heights = [3.2] if rate is None else [3.2, 1.0]
+    figure = Figure(figsize=(8.0, 3.0 if rate is None else 3.8), layout="constrained")
+    panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    above = panels[0]
+    if rate is not None:
+        panels[1].plot(*rate, color=INK, linewidth=1.2)
+        panels[1].set(ylabel="learning rate", ylim=(0, None))
+        panels[1].ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
+    drawn = []
+    for name, curve in losses.items():
+        colour, label = LOSSES[name]
+        window = len(curve.step) // 20
+        if window > 1:
+            # Single batches scatter: they stay visible, pale, behind their running mean.
+            above.plot(*curve, color=colour, linewidth=0.6, alpha=0.3, zorder=1)
+            curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean of {window} records"
+        marker = "" if len(curve.step) > 30 else "o"
+        above.plot(*curve, color=colour, label=label, clip_on=False, marker=marker, markersize=3.5)
+        drawn.append(curve.value)
+    shown = np.concatenate(drawn)
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    if len(shown):
+        above.set_ylim(shown.min() / 1.6, shown.max() * 1.3)
+    if "val/loss" in losses and np.isfinite(losses["val/loss"].value).any():
+        step, value = losses["val/loss"]
+        best = int(np.nanargmin(value))
+        above.annotate(
+            f"best {value[best]:.3g}", (step[best], value[best]), xytext=(0, 7), textcoords="offset points",
+            ha="right", fontsize=7.5, color=VERMILION, zorder=5,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        )  # fmt: skip
+    above.set(yscale="log", ylabel="loss (log scale)")
+    above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    above.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    above.yaxis.set_minor_locator(NullLocator())
+    for axes in panels:
+        open_frame(axes)
+        axes.set_xlim(0, max(curve.step.max() for curve in losses.values()))
+    above.legend(loc="lower left")
+    panels[-1].set_xlabel("training step")
+    return figure
+
+
+@styled
+def azimuth_figure(objects: Sequence[Mapping[str, Any]]) -> Figure:
+    """A panel an object; the truth is marked, and the share of pairs whose least energy is within 15 degrees of it.
+
+    Each has `object` (name), `ambiguity`, that share as `within`, and its mean `energy` over `degrees` from the truth.
+    """
+    rows, columns = math.ceil(len(objects) / COLUMNS), min(COLUMNS, len(objects))
+    figure = Figure(figsize=(2.1 * columns, 1.5 * rows + 0.2))
+    figure.set_layout_engine("constrained", wspace=0.04, hspace=0.06)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for axes, each in zip(grid.flat, objects, strict=False):
+        open_frame(axes)
+        axes.axvline(0, color=TRUTH, linewidth=2.5, alpha=0.8, zorder=1)
+        # The circle is closed: what is at -180 is at 180 as well.
+        place = [*each["degrees"], each["degrees"][0] + 360]
+        above = np.array([*each["energy"], each["energy"][0]]) - min(each["energy"])
+        axes.plot(place, above, color=CLASS_COLOURS[each["ambiguity"]], zorder=3)
+        axes.set_title(f"{each['object'].replace('_', ' ')}, {each['within']:.0%}")
+        axes.set_xlim(-180, 180)
+        style.degrees(axes, "x", 90)
+        axes.locator_params(axis="y", nbins=4)
+    for axes in list(grid.flat)[len(objects) :]:
+        axes.remove()
+    figure.supxlabel("longitude from the truth; in the title: share of pairs whose least energy is within 15°", size=8)
+    figure.supylabel("denoising error above its least", size=8)
+    keys = style.class_keys([each["ambiguity"] for each in objects])
+    figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), labelcolor=MUTED)
+    return figure
