@@ -42,7 +42,7 @@ from lp_framework.geometry import apply_relative_pose, relative_pose
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.solvers.base import Pairs
 from lp_framework.viz.cameras import RED, CameraScene, camera_methods_figure, colour_of
-from lp_framework.viz.maps import minima_in_words, start_names
+from lp_framework.viz.maps import ends_in_words, minima_in_words
 from lp_framework.viz.panels import FailureRow, failures_figure
 
 CPU = torch.device("cpu")
@@ -153,7 +153,7 @@ def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
     trajectories = pair.trajectories
     assert trajectories.shape == (4, 41, 3) and figure.shown_steps == [0, 10, 40]
     np.testing.assert_allclose(np.degrees(trajectories[:, 0, 1]) % 360, [0, 90, 180, 270], atol=1e-3)
-    assert start_names(pair) == ["0°", "90°", "180°", "270°"]
+    assert [start for start, _ in ends_in_words(pair)] == ["0°", "90°", "180°", "270°"]
     # An image of this prior holds its pose in the first three numbers: the views' are those of the trajectory.
     pairs, _ = named_pairs(data, ["cup"], [(1, 2)], CPU)
     pose = pairs.images[pairs.reference][0].flatten()[:3]

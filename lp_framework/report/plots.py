@@ -125,9 +125,6 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray]) -> go.Figure:
     return figure.add_trace(_trace(_centres(poses), mode="markers+text", marker=marker, hoverinfo="text", **text))
 
 
-# ---------------------------------------------------------------- a pair
-
-
 def frame_steps(pair: ShownPair) -> list[int]:
     """The steps of the solver that the frames of a pair show, the last one among them."""
     steps: list[int] = np.unique(np.linspace(0, _parts(pair)[1].shape[1] - 1, FRAMES).round().astype(int)).tolist()
@@ -228,12 +225,10 @@ def _parts(pair: ShownPair) -> tuple[NDArray, NDArray]:
 
 
 def _of(pair: ShownPair, landscape: str) -> dict[str, Any]:
-    """What marks a trace as one of a landscape; the first one is shown."""
     return {"meta": landscape, "visible": landscape == next(iter(pair.landscapes))}
 
 
 def _relief(name: str, landscape: Landscape) -> dict[str, Any]:
-    """A landscape for a contour or a surface."""
     latitude, longitude, energy = closed(landscape)
     hover = f"{PLACE}: %{{z:.4g}}<extra>{name}</extra>"
     values = {"x": _numbers(longitude), "y": _numbers(latitude), "z": _numbers(energy)}
@@ -243,7 +238,6 @@ def _relief(name: str, landscape: Landscape) -> dict[str, Any]:
 def _add_trails(
     figure: go.Figure, pair: ShownPair, along: Points, colours: Sequence[str], widths: Sequence[float], **more: Any
 ) -> None:
-    """Two traces of lines: the ways of the other starts, and the answer's."""
     for paths, colour, width in zip(_parts(pair), colours, widths, strict=True):
         known = [path[np.isfinite(path).all(axis=-1)] for path in paths]
         points = [np.pad(along(path), ((0, 1), (0, 0)), constant_values=np.nan) for path in known if len(path)]
@@ -254,7 +248,6 @@ def _add_trails(
 def _add_moving(
     figure: go.Figure, pair: ShownPair, place: Points, others: str, sizes: Sequence[float], **more: Any
 ) -> list[Moving]:
-    """Two traces of marks at the ends of the ways, for the other starts and for the answer."""
     moving = []
     kinds = (("another start", others, "circle"), ("answer", ANSWER, "diamond"))
     for paths, (name, colour, symbol), size in zip(_parts(pair), kinds, sizes, strict=True):
@@ -264,7 +257,6 @@ def _add_moving(
 
 
 def _framed(figure: go.Figure, pair: ShownPair, moving: Sequence[Moving]) -> go.Figure:
-    """The figure with its frames, one for each of `frame_steps`."""
     frames = [[_xyz(each.place(each.paths[:, step])) for each in moving] for step in frame_steps(pair)]
     return figure.update_layout(meta={"traces": [each.trace for each in moving], "frames": frames})
 
@@ -294,9 +286,6 @@ def _raised(landscape: Landscape, place: Points) -> Points:
     return raised
 
 
-# ---------------------------------------------------------------- cameras
-
-
 def _space(radius: float, longitude: float) -> go.Figure:
     """The ground with its longitudes, for cameras at most `radius` away, seen from above a longitude."""
     x, y, _ = 1.9 * _standing(np.array([math.sin(longitude + 0.6), 0.0, math.cos(longitude + 0.6)]))
@@ -316,7 +305,6 @@ def _standing(points: NDArray) -> NDArray:
 
 
 def _centres(poses: NDArray) -> NDArray:
-    """Where cameras at view poses `[V, 3]` are, `[V, 3]` in plotly's space."""
     return _standing(camera_to_world(torch.from_numpy(poses))[:, :3, 3].numpy())
 
 
@@ -328,7 +316,6 @@ def _frustum(pose: NDArray, distance: float) -> NDArray:
 
 
 def _add_camera(figure: go.Figure, pose: NDArray, image: NDArray, distance: float, colour: str, width: float) -> None:
-    """What a camera sees at a distance, in the colour of its edges."""
     frustum = _frustum(pose, distance)
     figure.add_traces([_image(frustum, image), _line(frustum[OUTLINE], colour, width)])
 
@@ -359,9 +346,6 @@ def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
     below = corner + columns + 1
     corners = {"i": (corner, corner + 1), "j": (below, below), "k": (corner + 1, below + 1)}
     return {**_xyz(points.reshape(-1, 3)), **{name: np.concatenate(both).tolist() for name, both in corners.items()}}
-
-
-# ---------------------------------------------------------------- pieces of figures
 
 
 def _figure(**layout: Any) -> go.Figure:

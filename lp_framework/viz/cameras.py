@@ -27,8 +27,21 @@ ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the
 NEAR_BY = 0.34  # how far from a camera its image is drawn, as a share of the largest radius
 LARGEST = 128  # pixels a side of an image in the scene, but for the one in the middle
 SIDE = 0.1  # inches: the margin
+MOST_CARDS, CARD_COLUMNS = 12, 6
+# Inches: the figure's width, the title, the tallest scene, the text below an image, gaps between images.
+WIDTH, TOP, TALLEST, TEXT, GAP = 8.0, 0.3, 4.6, 0.66, 0.12
 
-# ---------------------------------------------------------------- the scene
+# Of the figure of methods.
+RED, SKY = "#D7191C", "#56B4E9"
+TARGETS = (BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, MUTED)  # a colour a target view
+FRUSTUM = 0.2  # of the largest radius
+# True cameras are wide and light, so that a predicted one on them can be seen.
+TRUE: dict[str, Any] = {"linewidth": 2.4, "alpha": 0.55}
+PREDICTED: dict[str, Any] = {"linewidth": 0.9}
+# Inches: the figure's width, the column of images, room for titles and for the key, gaps.
+METHODS_WIDTH, IMAGES, TITLE, KEY, BETWEEN, APART = 7.0, 2.0, 0.22, 0.26, 0.05, 0.08
+IMAGE_COLUMNS = 3
+IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
 
 
 def viewpoint(latitude: float, longitude: float) -> NDArray:
@@ -38,10 +51,8 @@ def viewpoint(latitude: float, longitude: float) -> NDArray:
 
 
 def best_viewpoint(poses: NDArray) -> NDArray:
-    """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart.
-
-    That is where charges, one at each camera, one where its image is drawn, and four at the object, would have least
-    energy.
+    """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart: where
+    charges, one at each camera, one where its image is drawn, and four at the object, would have least energy.
     """
     centres = _cameras(poses)[:, :3, 3]
     points = np.concatenate([np.zeros((4, 3)), centres, centres * (1 - NEAR_BY)])
@@ -51,8 +62,7 @@ def best_viewpoint(poses: NDArray) -> NDArray:
 
 
 def image_plane(camera: NDArray, distance: float, half_angle: float) -> NDArray:
-    """Corners `[4, 3]` of what a camera `[4, 4]` sees at a distance: lower left, lower right, upper right, upper left.
-
+    """Corners `[4, 3]` of what a camera `[4, 4]` sees at a distance: lower left, lower right, upper right, upper left;
     `half_angle` is half of its field of view (radians).
     """
     side = distance * math.tan(half_angle)
@@ -66,13 +76,11 @@ def _cameras(poses: NDArray) -> NDArray:
     return cameras
 
 
-def _circle(degrees: range) -> NDArray:
-    """Points `[K, 3]` at distance 1 from the object, at latitude 0."""
-    longitude = np.radians(degrees)
-    return np.stack([np.sin(longitude), np.zeros_like(longitude), np.cos(longitude)], axis=-1)
-
-
-ROUND, SPOKES = _circle(range(0, 361, 2)), _circle(range(0, 360, 30))
+# Points `[K, 3]` at distance 1 from the object, at latitude 0.
+ROUND, SPOKES = (
+    np.stack([np.sin(longitude), np.zeros_like(longitude), np.cos(longitude)], axis=-1)
+    for longitude in (np.radians(range(0, 361, 2)), np.radians(range(0, 360, 30)))
+)
 
 
 class Scene:
@@ -130,25 +138,13 @@ def shrunk(image: Image.Image) -> Image.Image:
     return small
 
 
-# ---------------------------------------------------------------- the cameras of photographs
-
-MOST_CARDS, CARD_COLUMNS = 12, 6
-# Inches: the figure's width, the title, the tallest scene, the text below an image, gaps between images.
-WIDTH, TOP, TALLEST, TEXT, GAP = 8.0, 0.3, 4.6, 0.66, 0.12
-
-
 @styled
 def cameras_figure(
-    poses: NDArray,
-    images: Sequence[Image.Image],
-    numbers: Sequence[int],
-    titles: Sequence[str],
+    poses: NDArray, images: Sequence[Image.Image], numbers: Sequence[int], titles: Sequence[str],
     field_of_view_degrees: float,
-) -> Figure:
-    """Cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title.
-
-    The first is the reference; its image also stands for the object, as a cut-out in the middle. Below the scene are
-    the images (the first `MOST_CARDS`) with their poses.
+) -> Figure:  # fmt: skip
+    """Cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title, and below them the
+    images (the first `MOST_CARDS`) with their poses. The first is the reference; its image also stands for the object.
     """
     cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())
     middle = image_plane(cameras[0], float(poses[0, 2]), half_angle)  # through the object's centre
@@ -190,7 +186,6 @@ def cameras_figure(
 
 
 def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: Image.Image, colour: str) -> None:
-    """A pyramid from the camera's centre to its image, its line of sight, and its height above the ground."""
     order = 100.0 + 10 * float(scene.nearness(centre))
     height, sight = (scene.project(np.stack([centre, end])).T for end in (centre * [1, 0, 1], 0 * centre))
     scene.axes.plot(*height, color=MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
@@ -202,29 +197,13 @@ def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: Image.Ima
 
 
 def _badge(colour: str) -> dict[str, Any]:
-    """The style of a number on a disk."""
     disk = {"boxstyle": "circle,pad=0.25", "facecolor": colour, "edgecolor": "white", "linewidth": 0.8}
     return {"color": "white", "fontsize": 6.5, "fontweight": "bold", "ha": "center", "va": "center", "bbox": disk}
 
 
-# ---------------------------------------------------------------- the cameras that methods predict
-
-RED, SKY = "#D7191C", "#56B4E9"
-TARGETS = (BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, MUTED)  # a colour a target view
-FRUSTUM = 0.2  # of the largest radius
-# True cameras are wide and light, so that a predicted one on them can be seen.
-TRUE: dict[str, Any] = {"linewidth": 2.4, "alpha": 0.55}
-PREDICTED: dict[str, Any] = {"linewidth": 0.9}
-# Inches: the figure's width, the column of images, room for titles and for the key, gaps.
-METHODS_WIDTH, IMAGES, TITLE, KEY, BETWEEN, APART = 7.0, 2.0, 0.22, 0.26, 0.05, 0.08
-IMAGE_COLUMNS = 3
-IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
-
-
 class CameraScene(NamedTuple):
-    """One object: images (RGBA) and view poses `[V, 3]`, of which the first is the reference's, and
-    their field of view (radians); and of each method the predicted view poses `[V - 1, N, 3]` of the others from N
-    starts, with a word on how good they are.
+    """One object: images (RGBA) and view poses `[V, 3]`, the reference's first, and their field of view (radians); of
+    each method the predicted view poses `[V - 1, N, 3]` of the others from N starts, and a word on how good they are.
     """
 
     title: str
@@ -266,14 +245,12 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
         Line2D([], [], color=INK, label="true cameras, a colour a view", **TRUE),
         Line2D([], [], color=INK, label="predicted, one for each start", **PREDICTED),
     ]
-    sheet.legend(
-        keys, METHODS_WIDTH - SIDE, sheet.height - 0.18, columnspacing=1.6, handlelength=1.8, handletextpad=0.8
-    )
+    spaces = {"columnspacing": 1.6, "handlelength": 1.8, "handletextpad": 0.8}
+    sheet.legend(keys, METHODS_WIDTH - SIDE, sheet.height - 0.18, **spaces)
     return sheet.figure
 
 
 def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray) -> None:
-    """The reference's cut-out in the middle, the true cameras and those predicted, `[V - 1, N, 3]`."""
     cameras, half_angle = _cameras(content.poses), content.field_of_view / 2
     middle = image_plane(cameras[0], float(content.poses[0, 2]), half_angle)
     scene.image(shrunk(content.images[0]), middle, order=10.0)

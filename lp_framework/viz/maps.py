@@ -26,6 +26,12 @@ SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it
 RELIEF = "cividis"
 LEVELS = 9  # contour lines
 
+# Of the page of a pair, in inches: its width, margins, and the room between images and maps for labels; the maps'
+# colour bar; the maps' labels and their key; between maps; a line above an image; sides of images.
+WIDTH, SIDE, TOP, LABELS, BAR = 8.0, 0.1, 0.74, 0.62, 0.78
+BELOW, BETWEEN, CAPTION = 0.66, 0.38, 0.2
+IMAGE, LARGEST_VIEW = 1.72, 1.2
+
 
 def _mark(marker: str, size: float, face: str, edge: str, width: float, **others: Any) -> dict[str, Any]:
     style = {"markersize": size, "markerfacecolor": face, "markeredgecolor": edge, "markeredgewidth": width}
@@ -39,13 +45,10 @@ START_MARK = _mark("o", 4.5, "white", OTHERS, 1.0)
 MINIMUM_MARK = _mark("+", 9, INK, "white", 1.3, path_effects=[withStroke(linewidth=2.5, foreground=INK)])
 
 
-# ---------------------------------------------------------------- one map
-
-
 def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: float = 60.0) -> ScalarMappable | None:
     """Draw a map and the true relative pose `[3]`; returns what a colour bar of its relief or its arrows needs.
 
-    Latitudes within `limit` degrees, or those of the relief, whose local minima are marked.
+    Latitudes are within `limit` degrees, or those of the relief, whose local minima are marked.
     """
     axes.set_title(content.title, pad=3)
     axes.spines[:].set(color=FAINT)
@@ -81,7 +84,6 @@ def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: 
 def _draw_ground(
     axes: Axes, landscape: Landscape, colours: str | Colormap, norm: Normalize | None = None
 ) -> ScalarMappable:
-    """The energies as colours with contour lines."""
     latitude, longitude, energy = closed(landscape)
     place = longitude, latitude, energy
     levels = LEVELS if norm is None else np.linspace(0.1, 0.9, LEVELS)
@@ -175,14 +177,6 @@ def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
     return [Line2D([], [], label=label, **mark) for shown, label, mark in entries if shown]
 
 
-# ---------------------------------------------------------------- the page of a pair
-
-# Inches: the page's width, margins, and the room between images and maps for labels; the maps' colour bar.
-WIDTH, SIDE, TOP, LABELS, BAR = 8.0, 0.1, 0.74, 0.62, 0.78
-BELOW, BETWEEN, CAPTION = 0.66, 0.38, 0.2  # the maps' labels and their key; between maps; a line above an image
-IMAGE, LARGEST_VIEW = 1.72, 1.2  # sides
-
-
 @styled
 def pair_figure(
     pair: ShownPair, maps: Sequence[PoseMap], title: str, note: str, views: Sequence[NDArray] = ()
@@ -230,14 +224,11 @@ def pair_figure(
     return sheet.figure
 
 
-# ---------------------------------------------------------------- in 3-D
-
-
 @styled
 def surface_figure(landscape: Landscape, truth: NDArray | None = None, title: str = "") -> Figure:
     """The landscape in 3-D over its own map; the true relative pose `[3]` (radians) is marked on both."""
     sheet = Sheet(4.8, 3.6)
-    draw_surface(sheet.axes(-0.096, -0.072, 4.704, 3.78, projection="3d"), landscape, truth)
+    _draw_surface(sheet.axes(-0.096, -0.072, 4.704, 3.78, projection="3d"), landscape, truth)
     sheet.head(title)
     return sheet.figure
 
@@ -247,7 +238,7 @@ def small_surface(
 ) -> Axes3D:
     """A landscape as a small surface that fills a box of the sheet, in its own range."""
     axes: Axes3D = sheet.axes(x, y, wide, tall, projection="3d")
-    draw_surface(axes, landscape, truth)
+    _draw_surface(axes, landscape, truth)
     axes.set(xlabel="", ylabel="", zlabel="", xticks=[0, 90, 180, 270], yticks=[-30, 30])
     axes.patch.set_visible(False)
     axes.tick_params(labelsize=6, pad=-4)
@@ -257,8 +248,7 @@ def small_surface(
     return axes
 
 
-def draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None = None) -> None:
-    """Draw what `surface_figure` shows into axes of projection `3d`."""
+def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> None:
     latitude, longitude, energy = closed(landscape)
     low, high = float(np.nanmin(energy)), float(np.nanmax(energy))
     relief = (high - low) or 1.0
@@ -284,30 +274,24 @@ def draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None = Non
     axes.xaxis.set_major_locator(MultipleLocator(60))
     # The corner belongs to 360 degrees.
     axes.set_yticks([each for each in range(-150, 180, 30) if latitude[0] + 1 < each < latitude[-1] + 1])
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(StrMethodFormatter("{x:g}°"))
     axes.set_zticks([each for each in MaxNLocator(4).tick_values(low, high) if low <= each <= high])
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        if axis is not axes.zaxis:
+            axis.set_major_formatter(StrMethodFormatter("{x:g}°"))
         axis.pane.set_visible(False)
         axis._axinfo["grid"].update(color=FAINT, linewidth=0.4)
 
 
-# ---------------------------------------------------------------- in words
-
-
 def captions(pair: ShownPair) -> list[str]:
     """For every end of a pair the longitude of its start, and how far off it is, as far as they are known."""
-    return [": ".join(filter(None, each)) for each in zip(start_names(pair), errors_in_words(pair), strict=True)]
+    return [": ".join(filter(None, each)) for each in ends_in_words(pair)]
 
 
-def start_names(pair: ShownPair) -> list[str]:
-    """The longitude of every start, reduced and rounded to a degree."""
-    return ["" if longitude is None else f"{longitude:.0f}°" for longitude in pair.start_longitudes()]
-
-
-def errors_in_words(pair: ShownPair) -> list[str]:
-    """The rotation error of every end."""
-    return ["" if np.isnan(error) else f"{error:.0f}° off" for error in pair.rotation_errors]
+def ends_in_words(pair: ShownPair) -> list[tuple[str, str]]:
+    """For every end of a pair the longitude of its start, and the rotation error, or empty where not known."""
+    starts = ["" if longitude is None else f"{longitude:.0f}°" for longitude in pair.start_longitudes()]
+    errors = ["" if np.isnan(error) else f"{error:.0f}° off" for error in pair.rotation_errors]
+    return list(zip(starts, errors, strict=True))
 
 
 def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:

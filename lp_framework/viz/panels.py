@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lp_framework.analysis.landscapes import Landscape
 from lp_framework.analysis.shown import PoseMap, ShownPair
-from lp_framework.viz.maps import draw_map, errors_in_words, minima_in_words, small_marks, small_surface, start_names
+from lp_framework.viz.maps import draw_map, ends_in_words, minima_in_words, small_marks, small_surface
 from lp_framework.viz.style import ANSWER, ASIDE, INK, Sheet, letter, styled
 
 WIDTH, SIDE, TITLE, GAP = 7.0, 0.06, 0.24, 0.05  # inches: the figure's width and margin, room for a title, gaps
@@ -53,7 +53,7 @@ def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -
     sheet.above(left, TITLE, "(c) generated on the way")
     for column, step in enumerate(steps):
         sheet.text(left + label + column * (view + GAP) + view / 2, TITLE + 0.12, f"step {step}", ha="center", **SMALL)
-    for number, (row, start, off) in enumerate(zip(views, start_names(pair), errors_in_words(pair), strict=True)):
+    for number, (row, (start, off)) in enumerate(zip(views, ends_in_words(pair), strict=True)):
         y = TITLE + 0.18 + number * (view + GAP)
         answer = number == pair.chosen
         style: Any = {"fontsize": 7, "color": ANSWER if answer else INK}
@@ -158,12 +158,7 @@ def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figu
 
 
 def _place_map(
-    sheet: Sheet,
-    box: tuple[float, float, float, float],
-    content: PoseMap,
-    truth: NDArray | None,
-    first: bool = True,
-    last: bool = True,
+    sheet: Sheet, box: Sequence[float], content: PoseMap, truth: NDArray | None, first: bool = True, last: bool = True
 ) -> None:
     """A small map without its title, labelled where it is the first of its row and in the last one."""
     axes = sheet.axes(*box)
