@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lp_framework.report.paper import paper_table, paper_tables
-from lp_framework.report.sweeps import METRICS
+from lp_framework.report.sweep_tables import METRICS
 
 TABLES = Path(__file__).parent / "data" / "paper_tables.txt"
 

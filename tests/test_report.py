@@ -16,8 +16,7 @@ from result_folders import metrics, write_job, write_result
 from lp_framework.errors import UserError
 from lp_framework.report.runs import checkpoint_setting, find_runs, read_run
 from lp_framework.report.sweep_figures import Curve, Panel, curves_figure, sweep_figure
-from lp_framework.report.sweep_tables import sweep_tables, varying
-from lp_framework.report.sweeps import csv_rows, layout
+from lp_framework.report.sweep_tables import csv_rows, layout, sweep_tables, varying
 
 RECALLS = {0: (0.80, 0.82, 0.90), 0.3: (0.90, 0.91, 0.95)}  # by gamma, of seeds 0, 1, 2
 

@@ -13,8 +13,8 @@ from lp_framework.commands.building import plain, run_folder, versions
 from lp_framework.errors import UserError
 from lp_framework.report.page import PAGE, write_report_page
 from lp_framework.report.runs import find_runs, run_folders
-from lp_framework.report.sweep_tables import Objects, sweep_tables
-from lp_framework.report.sweeps import counted, draw_sweep, sweep_sections, terminal, write_sweeps
+from lp_framework.report.sweep_figures import draw_sweep
+from lp_framework.report.sweep_tables import Objects, counted, sweep_sections, sweep_tables, terminal, write_sweeps
 
 
 def run(config: DictConfig) -> None:

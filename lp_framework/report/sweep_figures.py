@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +16,8 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
-from lp_framework.report.sweep_tables import Row, Spread, SweepTable, heading, shown
-from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, VERMILION, open_frame, styled
+from lp_framework.report.sweep_tables import Row, Spread, Sweep, SweepTable, heading, layout, shown
+from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, VERMILION, open_frame, save_figure, styled
 
 AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins
 RECALL, SUCCESS, ROTATION_RECALL = (
@@ -31,6 +32,7 @@ NONE = Spread(math.nan, math.nan)
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = (0, (3, 2))  # of the paper's curves
+PLACE = ("data.name", "protocol", "checkpoint", "prior.name", "solver.name", "start.name", "views")  # of all runs
 
 
 class Curve(NamedTuple):
@@ -50,6 +52,15 @@ class Panel(NamedTuple):
     xlabel: str
     curves: Sequence[Curve]
     logarithmic: bool = False
+
+
+def draw_sweep(table: SweepTable, folder: Path) -> Sweep:
+    """A table with the figures that it calls for, which are saved in `folder`."""
+    name = table.experiment or "runs"
+    shared = [f"{heading(key)} {shown(table.common[key])}" for key in PLACE if table.common.get(key) is not None]
+    figures = {name: sweep_figure(table), f"{name}_seconds": cost_figure(table)}
+    files = [file for stem, each in figures.items() if each is not None for file in save_figure(each, folder / stem)]
+    return Sweep(", ".join([name, *shared]), table, layout(table), files)
 
 
 def sweep_figure(table: SweepTable) -> Figure | None:
