@@ -7,10 +7,11 @@ import importlib
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -38,6 +39,19 @@ OPTIONS: dict[str, dict[str, Any]] = {  # Hydra's, as argparse takes them
     "--cfg -c": {"choices": ["job", "hydra", "all"]},
     "--info -i": {"choices": ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]},
 }
+
+
+# Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
+OF_NO_USE = (
+    r"The '\w+' does not have many workers",  # batches come from memory, in this process
+    r"Detected pickle protocol \d+ in the checkpoint",  # it is refused with a sentence of ours
+    r"`isinstance\(treespec, LeafSpec\)` is deprecated",
+    r"The number of training batches .* is smaller than the logging interval",
+    r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk
+    r"Experiment logs directory .* exists and is not empty",  # it is the run's folder
+    r"Checkpoint directory .* exists and is not empty",
+    r"Total length of `DataLoader` across ranks is zero",  # an evaluation of which only the tables were missing
+)
 
 
 class UsageError(UserError):
@@ -90,7 +104,9 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             own += ["hydra.mode=RUN"] if sweep else []  # an experiment may ask for a sweep
             sys.argv = [sys.argv[0], command, *options, *own, *job.overrides.task]
             try:
-                importlib.import_module(f"lp_framework.commands.{command}").run(config)
+                module = importlib.import_module(f"lp_framework.commands.{command}")
+                with _orderly_console():
+                    module.run(config)
             except (UserError, MissingMandatoryValue, InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
                 if sweep:
@@ -127,6 +143,27 @@ def _restored() -> Iterator[None]:
         for key in {*os.environ} - {*environment}:
             del os.environ[key]
         os.environ.update(environment)
+
+
+@contextmanager
+def _orderly_console() -> Iterator[None]:
+    """Lightning's notes go to the run's log alone; warnings go to the log and, one line each, to the console."""
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        notes = logging.getLogger(name)
+        notes.handlers.clear()  # Hydra's handlers, above it, take over
+        notes.propagate = True
+
+    def show(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int,
+        file: TextIO | None = None, line: str | None = None,
+    ) -> None:  # fmt: skip
+        log.warning("%s", " ".join(str(message).split()))
+
+    with warnings.catch_warnings():
+        for beginning in OF_NO_USE:
+            warnings.filterwarnings("ignore", beginning)
+        warnings.showwarning = show
+        yield
 
 
 def _store_plugin_configs(config_dir: str | None) -> None:

@@ -205,7 +205,7 @@ def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path)
 def test_mistakes_are_met_before_any_model_is_loaded(lp, photos, overrides, error, tmp_path, monkeypatch):
     if "broken" in str(overrides):
         (photos / "broken.png").write_bytes((photos / "front.png").read_bytes()[:400])
-    monkeypatch.setattr("lp_framework.commands.estimate.Components", lambda settings: pytest.fail("too early"))
+    monkeypatch.setattr(Components, "__getitem__", lambda components, group: pytest.fail("too early"))
     finished = estimate(lp, *overrides)
     assert finished.status == 1 and error in finished.error
 

@@ -28,9 +28,7 @@ from lp_framework.benchmarks import (
 )
 from lp_framework.benchmarks.harness import Section
 from lp_framework.benchmarks.zero123 import Computing
-from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
-from lp_framework.commands.device import choose_device
-from lp_framework.data.module import PairDataModule
+from lp_framework.commands.building import Components, begin, versions
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
 from lp_framework.models.checkpoints import SHIPPED, load_model
@@ -52,18 +50,15 @@ MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]]
 }
 
 
-@orderly_console()
 def run(config: DictConfig) -> None:
     """Run the measurements named in `measure`; what has been measured so far is always in `bench.json`."""
-    settings = plain(config)
+    folder, device, components = begin(config)
+    settings = components.settings
     names = [settings["measure"]] if isinstance(settings["measure"], str) else settings["measure"]
     for name in names:
         if name not in MEASUREMENTS:
             known = f"{nearest(str(name), MEASUREMENTS)} (known: {', '.join(MEASUREMENTS)})"
             raise UserError(f"measure={name} is none of the measurements{known}")
-    device = choose_device(settings["accelerator"])
-    folder = run_folder()
-    seed_run(0)
     facts = {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu",
         "threads": torch.get_num_threads(),
@@ -78,7 +73,7 @@ def run(config: DictConfig) -> None:
     try:
         for name in names:
             function, (title, contenders) = MEASUREMENTS[name]
-            wanted = arguments(name, function, settings, device, folder)
+            wanted = arguments(name, function, components, device, folder)
             section = Section(title, contenders, device, save)
             sections[name] = section
             with Console(stderr=True).status(f"measuring {name}"):
@@ -94,24 +89,17 @@ def run(config: DictConfig) -> None:
 
 
 def arguments(
-    name: str, function: Callable[..., None], settings: Mapping[str, Any], device: torch.device, folder: Path
+    name: str, function: Callable[..., None], components: Components, device: torch.device, folder: Path
 ) -> dict[str, Any]:
     """What a measurement takes besides its section: the settings of its name, and objects by theirs."""
-    components = Components(settings)
-
-    def data() -> PairDataModule:
-        module: PairDataModule = components["data"]
-        module.evaluate_on("ordered", 0)
-        module.prepare_data()
-        return module
-
+    settings = components.settings
     makers: dict[str, Callable[[], object]] = {
         "computing": lambda: Computing(**_settings(settings, "second_stage", Computing)),
         # The one that ships: figures are to be compared, whatever has been trained here.
         "model": lambda: load_model(SHIPPED / "score").to(device),
         "new_model": lambda: components["model"].to(device),
         "prior": lambda: components["prior"].to(device),
-        "data": data,
+        "data": components.test_views,
         "renderers": lambda: {
             each: registry.build("renderer", each) for each in registry.names("renderer") if each != "auto"
         },

@@ -7,12 +7,10 @@ import importlib.metadata
 import logging
 import platform
 import subprocess
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -26,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from lp_framework import registry
-from lp_framework.api import TINY_KNOWS
+from lp_framework.api import TINY_KNOWS, best_device
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.source import ViewSource
 from lp_framework.errors import UserError, one_line
@@ -35,39 +33,6 @@ from lp_framework.models.checkpoints import describe, find_checkpoint, load_mode
 log = logging.getLogger(__name__)
 
 TRAINING = "training.json"  # what a training run says of itself
-
-# Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
-OF_NO_USE = (
-    r"The '\w+' does not have many workers",  # batches come from memory, in this process
-    r"Detected pickle protocol \d+ in the checkpoint",  # it is refused with a sentence of ours
-    r"`isinstance\(treespec, LeafSpec\)` is deprecated",
-    r"The number of training batches .* is smaller than the logging interval",
-    r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk
-    r"Experiment logs directory .* exists and is not empty",  # it is the run's folder
-    r"Checkpoint directory .* exists and is not empty",
-    r"Total length of `DataLoader` across ranks is zero",  # an evaluation of which only the tables were missing
-)
-
-
-@contextmanager
-def orderly_console() -> Iterator[None]:
-    """Lightning's notes go to the run's log alone; warnings go to the log and, one line each, to the console."""
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
-        notes = logging.getLogger(name)
-        notes.handlers.clear()  # Hydra's handlers, above it, take over
-        notes.propagate = True
-
-    def show(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int,
-        file: TextIO | None = None, line: str | None = None,
-    ) -> None:  # fmt: skip
-        log.warning("%s", " ".join(str(message).split()))
-
-    with warnings.catch_warnings():
-        for beginning in OF_NO_USE:
-            warnings.filterwarnings("ignore", beginning)
-        warnings.showwarning = show
-        yield
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -84,8 +49,7 @@ class Components:
     """
 
     def __init__(self, settings: Mapping[str, Any], checkpoint: Path | None = None) -> None:
-        self.settings = settings
-        self.checkpoint = checkpoint
+        self.settings, self.checkpoint = settings, checkpoint
         self._built: dict[str, Any] = {}
 
     def __getitem__(self, group: str) -> Any:
@@ -97,6 +61,17 @@ class Components:
     def needs(self, group: str) -> list[str]:
         """The components that the chosen member of a group asks for."""
         return registry.component_names(registry.get(group, self.settings[group]["name"]))
+
+    def test_views(self, protocol: str = "ordered") -> PairDataModule:
+        """The data, prepared for the pairs of a protocol among their test views."""
+        data: PairDataModule = self["data"]
+        data.evaluate_on(protocol, self.settings.get("seed", 0))
+        data.prepare_data()
+        return data
+
+    def record(self) -> dict[str, Any]:
+        """What results say of the run that made them."""
+        return {"seed": self.settings["seed"], "config": self.settings, "versions": versions()}
 
     def _build(self, group: str) -> Any:
         build = build_data if group == "data" else partial(registry.build, group)
@@ -134,6 +109,20 @@ def warn_of_photographs(prior: Mapping[str, Any]) -> None:
     """Say that the bundled prior knows no photographs where `prior`, its settings, choose it."""
     if prior["name"] == "tiny" and prior["path"] is None:
         log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_KNOWS)
+
+
+def begin(config: DictConfig) -> tuple[Path, torch.device, Components]:
+    """What a run without a trainer begins with: its folder, the device of `accelerator`, and what the config chooses.
+
+    The device is a GPU where there is one for `auto`, `cpu`, or a GPU by its type, `cuda` or `mps`.
+    """
+    folder = run_folder()
+    seed_run(config.get("seed", 0))
+    best = best_device()
+    if config.accelerator not in ("auto", "cpu", best.type):
+        choices = " or ".join(dict.fromkeys(["auto", "cpu", best.type]))
+        raise UserError(f"accelerator={config.accelerator} is not available on this machine; choose {choices}")
+    return folder, torch.device("cpu") if config.accelerator == "cpu" else best, Components(plain(config))
 
 
 def seed_run(seed: object) -> None:

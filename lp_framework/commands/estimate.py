@@ -18,17 +18,7 @@ from rich.table import Table
 from torch import Tensor
 
 from lp_framework.api import move, view_set
-from lp_framework.commands.building import (
-    Components,
-    orderly_console,
-    plain,
-    run_folder,
-    seed_run,
-    versions,
-    warn_of_photographs,
-    warn_of_unused,
-)
-from lp_framework.commands.device import choose_device
+from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
 from lp_framework.data.camera_files import colmap_model, nerf_transforms
 from lp_framework.data.photographs import SIZE, photograph_files, prepared_photographs, save_png
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
@@ -48,16 +38,12 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@orderly_console()
 def run(config: DictConfig) -> None:
     """Estimate and write `transforms.json`, `poses.csv`, `colmap/`, `images/`, `cameras.png` and `results.json`."""
-    folder = run_folder()
-    seed_run(config.seed)
+    folder, device, components = begin(config)
     first = _reference_pose(config.latitude_degrees, config.radius)
-    device = choose_device(config.accelerator)
     files = photograph_files(config.images)
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
-    components = Components(plain(config))
     warn_of_unused(components)
     solver, starts = components["solver"], components["start"]
     move(solver, device)
@@ -74,10 +60,8 @@ def run(config: DictConfig) -> None:
         "network_passes": solution.cost.network_passes,
         "energies": energies.tolist(),
         "valid": bool(solution.valid[0]),
-        "seed": config.seed,
         "checkpoint": str(components.checkpoint) if components.checkpoint else None,
-        "config": plain(config),
-        "versions": versions(),
+        **components.record(),
     }
     write_json(folder / "results.json", result)
     rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist())

@@ -18,7 +18,6 @@ from rich.console import Console
 from lp_framework.commands.building import (
     Components,
     build_trainer,
-    orderly_console,
     plain,
     run_folder,
     seed_run,
@@ -43,7 +42,6 @@ LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and
 LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 starts, 18 from 2
 
 
-@orderly_console()
 def run(config: DictConfig) -> None:
     """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder.
 

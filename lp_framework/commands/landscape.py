@@ -24,17 +24,7 @@ from lp_framework.analysis.landscapes import landscape_grid
 from lp_framework.analysis.pairs import explained_pair, named_pairs
 from lp_framework.analysis.shown import PoseMap, ShownPair, View, words
 from lp_framework.api import move, view_set
-from lp_framework.commands.building import (
-    Components,
-    orderly_console,
-    plain,
-    run_folder,
-    seed_run,
-    versions,
-    warn_of_photographs,
-)
-from lp_framework.commands.device import choose_device
-from lp_framework.data.module import PairDataModule
+from lp_framework.commands.building import Components, begin, plain, warn_of_photographs
 from lp_framework.data.photographs import on_white, photograph_files, prepared_photographs
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_arrays, write_json
@@ -51,30 +41,24 @@ GRID = ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degre
 OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview has no use for
 
 
-@orderly_console()
 @torch.no_grad()
 def run(config: DictConfig) -> None:
     """The landscape of a pair of views where one is named, else the overview of all objects."""
     check(config)
-    folder = run_folder()
-    seed_run(config.seed)
+    folder, device, components = begin(config)
     grid = landscape_grid(**checked(landscape_grid, {key: config[key] for key in GRID}, ""))
     draws = checked_draws(config.timesteps, config.noises, config.seed, config.batch)
-    device = choose_device(config.accelerator)
-    components = Components(plain(config))
     console = Console(width=None if Console().is_terminal else 110, highlight=False)
     if config.object is None and config.images is None:
-        data = components["data"]
-        data.evaluate_on(config.protocol, config.seed)
-        data.prepare_data()
-        found = overview(data, components["prior"].to(device), device, draws, grid, config.azimuths, config.protocol)
+        data, prior = components.test_views(config.protocol), components["prior"].to(device)
+        found = overview(data, prior, device, draws, grid, config.azimuths, config.protocol)
         table, results = overview_table(f"{config.data.name}, prior={config.prior.name}", found), "azimuth.json"
         figures = {"azimuth": azimuth_figure(found["objects"])}
     else:
         if config.images is not None:
             pairs, pair = photographs(config, device)
         else:
-            pairs, pair = data_pair(config, components["data"], device)
+            pairs, pair = data_pair(config, components, device)
         solver, prior = components["solver"], components["prior"].to(device)
         move(solver, device)
         model = None if pair.truth is None else components["model"].to(device)
@@ -82,13 +66,13 @@ def run(config: DictConfig) -> None:
         with shown_progress():
             pair, views, field = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)
         checkpoint, method = components.checkpoint, words(config.solver.name)
-        found = {**summary(pair), "checkpoint": str(checkpoint) if checkpoint else None, "seed": config.seed}
+        found = {**summary(pair), "checkpoint": str(checkpoint) if checkpoint else None}
         table, results = pair_table(f"{pair.object}, prior={config.prior.name}", method, found), "landscape.json"
         write_arrays(folder / "landscape.npz", landscape_arrays(pair, field))
         example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
         save_examples(folder / "pictures" / EXAMPLES, [example])
         figures = pair_figures(pair, views, draws, f"Energy of prior {config.prior.name}, ways of {method}")
-    write_json(folder / results, {**found, "config": plain(config), "versions": versions()})
+    write_json(folder / results, {**found, **components.record()})
     pictures = [save_figure(figure, folder / name)[0].name for name, figure in figures.items()]
     console.print(table)
     console.print(f"results: {folder / results}", soft_wrap=True)
@@ -127,13 +111,12 @@ def pair_figures(pair: ShownPair, views: Sequence[NDArray], draws: Draws, headin
     return figures
 
 
-def data_pair(config: DictConfig, data: PairDataModule, device: torch.device) -> tuple[Pairs, ShownPair]:
+def data_pair(config: DictConfig, components: Components, device: torch.device) -> tuple[Pairs, ShownPair]:
     """Two test views of the data set's `object`."""
     for key in ("reference", "query"):
         if not isinstance(config[key], int):
             raise UserError(f"{key} must be the number of a test view, got {config[key]}")
-    data.evaluate_on("ordered", config.seed)
-    data.prepare_data()
+    data = components.test_views()
     pairs, (pair,) = named_pairs(data, [str(config.object)], [(config.reference, config.query)], device)
     title = f"{pair.title} ({pair.ambiguity}), views {config.reference} and {config.query}"
     return pairs, replace(pair, object=title)

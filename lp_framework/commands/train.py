@@ -31,7 +31,6 @@ from lp_framework.commands.building import (
     TRAINING,
     Components,
     build_trainer,
-    orderly_console,
     plain,
     run_folder,
     seed_run,
@@ -50,7 +49,6 @@ METRICS = "metrics.csv"  # Lightning's name
 OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, without use in eval
 
 
-@orderly_console()
 def run(config: DictConfig) -> None:
     """Train into this run's folder, or go on in the folder that `resume` names, or where this very run was stopped."""
     folder = run_folder() if config.resume is None else Path(config.resume)

@@ -17,8 +17,7 @@ from lp_framework.analysis.fields import generated_views
 from lp_framework.analysis.pairs import object_index
 from lp_framework.analysis.shown import words
 from lp_framework.api import image_batch
-from lp_framework.commands.building import Components, orderly_console, plain, run_folder, seed_run, versions
-from lp_framework.commands.device import choose_device
+from lp_framework.commands.building import begin
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
 from lp_framework.errors import UserError
@@ -33,16 +32,12 @@ FOLDER = "views"
 Source = tuple[Path, str, Image.Image]  # what is turned: its file, its name, and the prepared image (RGBA)
 
 
-@orderly_console()
 def run(config: DictConfig) -> None:
     """Write every view into `views/`, and `source.png`, `views.png`, `views.pdf` and `views.json`."""
-    folder = run_folder()
-    seed_run(config.seed)
+    folder, device, components = begin(config)
     latitudes, longitudes = angles(config.latitudes_degrees, config.longitudes)
     sampling = checked(Prior.generate, {key: config[key] for key in ("steps", "guidance", "eta")}, "")
-    device = choose_device(config.accelerator)
-    components = Components(plain(config))
-    file, name, image = photograph(config) if config.image is not None else data_view(config, components["data"])
+    file, name, image = photograph(config) if config.image is not None else data_view(config, components.test_views())
     prior: Prior = components["prior"].to(device)
     poses = grid(latitudes, longitudes)  # [rows, columns, 3]
     code, columns = prior.encode(image_batch([image]).to(device)), poses.transpose(0, 1).flatten(0, 1)
@@ -65,8 +60,7 @@ def run(config: DictConfig) -> None:
     ]
     for each, view in zip(records, views.reshape(-1, *views.shape[2:]), strict=True):
         save_png(folder / each["file"], Image.fromarray(view))
-    record = {"source": str(file), "views": records, "seed": config.seed}
-    write_json(folder / "views.json", {**record, "config": plain(config), "versions": versions()})
+    write_json(folder / "views.json", {"source": str(file), "views": records, **components.record()})
     settings = f"steps {config.steps}, guidance {config.guidance:g}, eta {config.eta:g}, seed {config.seed}"
     note = f"prior {config.prior.name}, {settings}"
     save_figure(views_figure(on_white(image), views, latitudes, longitudes, name, note), folder / "views")
@@ -103,8 +97,6 @@ def photograph(config: DictConfig) -> Source:
 
 def data_view(config: DictConfig, data: PairDataModule) -> Source:
     """The first test view of the data set's `object`, as it is."""
-    data.evaluate_on("ordered", config.seed)
-    data.prepare_data()
     file = data.table("test").objects[object_index(data, str(config.object))].files[0]
     return file, words(config.object), prepare(read_image(file), str(file), crop=False)
 
