@@ -25,7 +25,7 @@ from tiny_runs import Commands
 
 from lp_framework import api, load_prior, registry
 from lp_framework.benchmarks.zero123 import NARROW, random_pair
-from lp_framework.commands.eval_pictures import save_pictures
+from lp_framework.commands.eval import save_pictures
 from lp_framework.data.pairs import PairData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.priors.base import Prior

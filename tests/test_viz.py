@@ -23,7 +23,7 @@ from lp_framework.analysis.fields import ExactModel, grid_poses, model_arrows, m
 from lp_framework.analysis.landscapes import Arrows, cell_grid
 from lp_framework.analysis.pairs import in_one_scale
 from lp_framework.analysis.shown import PoseMap, ShownPair, View
-from lp_framework.commands.eval_pictures import save_pictures
+from lp_framework.commands.eval import save_pictures
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews
 from lp_framework.evaluation.evaluation import Evaluation

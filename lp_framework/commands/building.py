@@ -156,6 +156,20 @@ def run_folder() -> Path:
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
+def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[str, ...], saved: Path) -> DictConfig:
+    """The config of a resumed run: `previous`, of the file or folder `saved`, with what the command line changes.
+
+    Raises `UserError` for a key on it that does not begin as one of `changeable`.
+    """
+    overrides = HydraConfig.get().overrides.task
+    keys = {override.partition("=")[0].strip("+~") for override in overrides} - {"resume", "plugins"}
+    for key in sorted(keys):
+        if not key.startswith(changeable):
+            raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
+        OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
+    return previous
+
+
 def weights_fingerprint(networks: Sequence[nn.Module], sample: int = 1024) -> str:
     """A text that changes when networks do: of every parameter and buffer its name, shape and first values.
 

@@ -6,15 +6,19 @@ A run that was stopped is resumed by `resume=RUN_FOLDER`, or by the same command
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from lightning.pytorch.callbacks import RichProgressBar
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examples
+from lp_framework.analysis.shown import ShownPair
 from lp_framework.commands.building import (
     Components,
     build_trainer,
@@ -24,19 +28,30 @@ from lp_framework.commands.building import (
     versions,
     warn_of_unused,
     weights_fingerprint,
+    with_overrides,
 )
-from lp_framework.commands.eval_pictures import save_pictures
-from lp_framework.commands.finished import is_finished, unfinished_evaluation
 from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.evaluation.journal import Journal, goes_on, unfinished
-from lp_framework.evaluation.tables import summary_rows, terminal_table, write_result
+from lp_framework.evaluation.journal import (
+    FOLDER,
+    MOVABLE,
+    Journal,
+    compared_settings,
+    differences,
+    goes_on,
+    unfinished,
+)
+from lp_framework.evaluation.tables import RESULT, summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Solver
 from lp_framework.solvers.starts import Starts
+from lp_framework.viz.curves import errors_figure
+from lp_framework.viz.maps import pair_figure
+from lp_framework.viz.sheets import ObjectCard, objects_figure
+from lp_framework.viz.style import save_figure
 
 LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and many would be long unsaved
 LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 starts, 18 from 2
@@ -50,7 +65,7 @@ def run(config: DictConfig) -> None:
     folder, checkpoint = run_folder(), None
     if config.resume is not None:
         folder = Path(config.resume)
-        config, checkpoint = unfinished_evaluation(folder, config, HydraConfig.get().overrides.task)
+        config, checkpoint = unfinished_evaluation(folder, config)
     settings = plain(config)
     if settings["trainer"].get("precision", "32-true") != "32-true":
         raise UserError("trainer.precision: poses are computed in float32; prior.dtype=bfloat16 is Zero123's own")
@@ -96,7 +111,56 @@ def run(config: DictConfig) -> None:
     if before is not None and before["versions"] != result["versions"]:
         result["versions_before"] = before["versions"]  # of what was solved before it was stopped
     if trainer.is_global_zero:
-        write_all(folder, result, evaluation, data.data(data.evaluation_split()), journal)
+        write_result(folder, result, evaluation.metrics, evaluation.table)
+        journal.finish()
+        views = data.data(data.evaluation_split())
+        pictures = save_pictures(folder / "pictures", evaluation, views, result) if settings["pictures"] else []
+        print_results(folder, result, pictures)
+
+
+def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | None) -> bool:
+    """Whether `folder` has the results of this very job of a sweep, with `settings` and the model of `checkpoint`;
+    if so, that is printed.
+
+    The results have to be of the same configuration, seeds included, and not older than the checkpoint. Raises
+    `UserError` for other results: they are not overwritten. A job without a readable `results.json` is to be run.
+    """
+    if HydraConfig.get().mode != RunMode.MULTIRUN:
+        return False
+    file = folder / RESULT
+    try:
+        result = json.loads(file.read_text(encoding="utf-8"))
+        previous = compared_settings(result["config"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return False
+    before = {**previous, "checkpoint": result.get("checkpoint")}
+    now = {**compared_settings(json.loads(json.dumps(settings))), "checkpoint": checkpoint and str(checkpoint)}
+    changed = differences(before, now)
+    advice = "give another hydra.sweep.dir, or remove it"
+    if changed:
+        said = ", ".join(f"{key} is {there} there, {here} here" for key, (there, here) in list(changed.items())[:3])
+        raise UserError(f"{folder}: holds the results of another configuration ({said}); {advice}")
+    if checkpoint is not None and checkpoint.stat().st_mtime > file.stat().st_mtime:
+        raise UserError(f"{folder}: holds the results of an earlier {checkpoint}; {advice}")
+    print(f"skipped, finished before: {folder}")
+    return True
+
+
+def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig, Path | None]:
+    """The config and the checkpoint of the stopped `eval` in `folder`; it may be resumed on other devices.
+
+    Raises `UserError` where there is none, and for a command line with other settings.
+    """
+    if (folder / RESULT).is_file():
+        raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
+    subject = unfinished(folder)
+    if subject is None:
+        raise UserError(f"resume={folder}: holds no {FOLDER} evaluation to go on from; give the folder of one")
+    previous = OmegaConf.create(subject["config"])
+    if missing := sorted({*config} - {*previous}):
+        raise UserError(f"resume={folder}: is of another version of lp_framework, without {missing[0]}; evaluate anew")
+    checkpoint = Path(subject["checkpoint"]) if subject["checkpoint"] else None
+    return with_overrides(previous, config, MOVABLE, folder / FOLDER), checkpoint
 
 
 def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
@@ -114,23 +178,13 @@ def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
     return batch_pairs
 
 
-def write_all(folder: Path, result: dict[str, Any], evaluation: Evaluation, views: PairData, journal: Journal) -> None:
-    """Results, and pictures and page unless they are not wanted, once the results are those of all processes."""
-    write_result(folder, result, evaluation.metrics, evaluation.table)
-    journal.finish()
-    wanted = result["config"]["pictures"]
-    print_results(folder, result, save_pictures(folder / "pictures", evaluation, views, result) if wanted else [])
-
-
 def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]) -> None:
     """The table, the cost, and where the rest is."""
-    config = result["config"]
+    config, views = result["config"], result["config"]["views"]
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     choices = f"{config['data']['name']}, {config['solver']['name']}, start={config['start']['name']}"
-    sets = config["views"] is not None
-    counted = f"poses in sets of {config['views']} images" if sets else f"pairs ({config['protocol']})"
-    title = f"{choices}, {result['pairs']} {counted}"
-    console.print(terminal_table(title, summary_rows(result)))
+    counted = f"pairs ({config['protocol']})" if views is None else f"poses in sets of {views} images"
+    console.print(terminal_table(f"{choices}, {result['pairs']} {counted}", summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
     if result["unanswered"]:
         console.print(f"no answer for {result['unanswered']:.1%} of the pairs")
@@ -139,3 +193,45 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
         names = ", ".join(picture.name for picture in pictures)
         console.print(f"pictures: {folder / 'pictures'} ({names})", soft_wrap=True)
         console.print(f"page:     {write_run_page(folder, 'eval')}", soft_wrap=True)
+
+
+def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: Mapping[str, Any]) -> list[Path]:
+    """After `Trainer.test`: maps of some pairs (failures first), cumulative errors, and the objects, into `folder`.
+
+    Each as PNG and PDF; returns the PNG files. Sets of images have no maps. `EXAMPLES` below the folder gets the
+    pairs, for the page of the run.
+    """
+    examples = gather_examples(evaluation, data)
+    save_examples(folder / EXAMPLES, examples)
+    rows, table = evaluation.metrics.rows(), evaluation.table
+    rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
+    figures = {
+        f"field_{number}": pair_figure(pair, pair.maps, f"{pair.title} ({pair.ambiguity})", answer_note(pair))
+        for number, pair in enumerate(examples)
+        if pair.maps
+    }
+    classes = [table.ambiguities[index] for index in rows["object"].tolist()]
+    figures["errors"] = errors_figure(rotation, translation, chosen, classes)
+    figures["objects"] = objects_figure(object_cards(result["per_object"], data))
+    return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
+
+
+def answer_note(pair: ShownPair) -> str:
+    """Why a pair is shown, and how far off its answer is."""
+    degrees, distance = pair.rotation_errors[pair.chosen], pair.translation_errors[pair.chosen]
+    off = f"rotation error {degrees:.1f}°, translation error {distance:.2f}"
+    return f"{pair.reason}: {'no answer' if np.isnan(degrees) else off}"
+
+
+def object_cards(per_object: Mapping[str, Mapping[str, float] | None], data: PairData) -> list[ObjectCard]:
+    """A card for every object that has pairs, with its first view; no success rate where a pair has one answer."""
+    table, images = data.table, data.images
+    assert images is not None  # evaluation never caches features
+    return [
+        ObjectCard(
+            name, table.ambiguities[index], np.asarray(images[table.views_of(index)[0]]), metrics["R(R)@15"],
+            metrics.get("SR(R)@30"),
+        )
+        for index, name in enumerate(table.names)
+        if (metrics := per_object[name]) is not None
+    ]  # fmt: skip

@@ -35,8 +35,8 @@ from lp_framework.commands.building import (
     run_folder,
     seed_run,
     versions,
+    with_overrides,
 )
-from lp_framework.commands.finished import with_overrides
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
@@ -65,7 +65,7 @@ def run(config: DictConfig) -> None:
                 "validation; train anew"
             )
         # A run may be prolonged or moved to other devices.
-        config = with_overrides(before, config, HydraConfig.get().overrides.task, ("trainer",), saved)
+        config = with_overrides(before, config, ("trainer",), saved)
     elif begun and _saved_config(saved, config) != config:  # what was learned is not overwritten
         raise UserError(
             f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
