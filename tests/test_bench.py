@@ -16,16 +16,12 @@ from view_folders import write_objects
 from zero123_checkpoint import state_dict, write_checkpoint
 
 from lp_framework import registry
-from lp_framework.benchmarks import batches, counting, harness, precision, rendering, second_stage, zero123
-from lp_framework.benchmarks.adam_gauss_newton import followed, some_pairs
+from lp_framework.benchmarks import batches, counting, harness, rendering, second_stage, zero123
 from lp_framework.benchmarks.batches import loss_on, trunk_features
-from lp_framework.benchmarks.checkpoint import original_tensors
 from lp_framework.benchmarks.counting import counted, launched, peak_bytes
-from lp_framework.benchmarks.first_stage import all_pairs, plain_loop
 from lp_framework.benchmarks.harness import Section
-from lp_framework.benchmarks.precision import variant
-from lp_framework.benchmarks.scaling import exponent
-from lp_framework.benchmarks.second_stage import BATCHED, LOOP, Arithmetic, arithmetic_of
+from lp_framework.benchmarks.second_stage import BATCHED, LOOP, Arithmetic, arithmetic_of, followed, some_pairs, variant
+from lp_framework.benchmarks.stages import all_pairs, exponent, plain_loop
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
     Computing,
@@ -33,6 +29,7 @@ from lp_framework.benchmarks.zero123 import (
     batched,
     encoded,
     held_bytes,
+    original_tensors,
     plain_prior,
     random_pair,
 )
@@ -505,7 +502,7 @@ def test_variants_that_are_none(words):
 def test_the_layout_leaves_the_gradient_and_reduced_precision_nearly():
     variants = ["channels_last", "bfloat16"]
     measured = section()
-    precision.measure(measured, "narrow", variants, starts=2, rounds=1, steps=1, max_batch=None)
+    second_stage.measure_precision(measured, "narrow", variants, starts=2, rounds=1, steps=1, max_batch=None)
     off = {words: facts["gradient_deviation"] for words, facts in measured.facts.items()}
     assert list(off) == variants and off["channels_last"] < 1e-4 and 0 < off["bfloat16"] < 0.2
     assert [*measured.rows] == [f"{words}: {what}" for words in off for what in ("seconds a step", "share of peak")]

@@ -1,4 +1,4 @@
-"""The second stage on Zero123: all starts in one batch against a plain loop over them; a step, and a whole pair."""
+"""The second stage: on Zero123 batched against a loop and in reduced precision, and Gauss-Newton against Adam."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from lp_framework.benchmarks.counting import counted, launched, peak_rate
 from lp_framework.benchmarks.harness import Section, timed, worth
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
+    Architecture,
     Computing,
     PlainLoop,
     batched,
@@ -21,15 +24,28 @@ from lp_framework.benchmarks.zero123 import (
     plain_prior,
     random_pair,
 )
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.pairs import PairData
+from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
+from lp_framework.priors.base import Prior
 from lp_framework.priors.zero123.networks import DTYPES
+from lp_framework.solvers.base import Pairs, Solution, pairs_of
+from lp_framework.solvers.langevin import Langevin
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
-from lp_framework.solvers.two_stage import TwoStage
+from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
 BATCHED, LOOP = "batched", "plain loop"
 STEP = "second stage: a step of one pair", (BATCHED, LOOP)
 PAIR = "pair: both stages and encoding", (BATCHED, LOOP)
+PRECISION = "precision: a step of one pair", ("as named", "plain float32")
+DESCENT = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
+SWITCHES = ("channels_last", "compile", "cuda_graph")
+# What both are judged by: the energy under timesteps and noises that neither descends.
+PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
+PROBE_NOISES = 2  # a timestep
+PROBE_SEED = 1  # the solvers' is 0
 
 
 class Arithmetic(NamedTuple):
@@ -146,3 +162,117 @@ def arithmetic_of(computing: Computing, device: torch.device) -> dict[str, Arith
         BATCHED: Arithmetic(counted(ours), peak_rate(device, DTYPES[computing.dtype])),
         LOOP: Arithmetic(counted(plain), peak_rate(device, torch.float32), launched(plain)),
     }
+
+
+def variant(words: str, architecture: Architecture, max_batch: int | None) -> Computing:
+    """Of words such as "bfloat16 channels_last compile", in any order; the dtype is float32 where none is named."""
+    chosen, known = words.split(), [*DTYPES, *SWITCHES]
+    dtypes = [word for word in chosen if word in DTYPES]
+    if not chosen or len(dtypes) > 1 or not {*chosen} <= {*known}:
+        raise UserError(
+            f"precision.variants: '{words}' is none; give one or more of {', '.join(known)}, with one dtype at most"
+        )
+    settings = {"dtype": dtypes[0] if dtypes else "float32", **{word: word in chosen for word in SWITCHES}}
+    return Computing(architecture, **settings, max_batch=max_batch)  # type: ignore[arg-type]
+
+
+def measure_precision(
+    section: Section, architecture: Architecture, variants: Sequence[str], starts: int, rounds: int, steps: int,
+    max_batch: int | None,
+) -> None:  # fmt: skip
+    """`rounds` of `steps` steps of a pair from `starts` starts, on the same random weights.
+
+    One variant after the other, so that no more than two U-Nets are held.
+    """
+    device, plain = section.device, Computing(architecture, max_batch=max_batch)
+    computings = {words: variant(words, architecture, max_batch) for words in variants}
+    networks, pair = plain.networks(device), random_pair(device)
+    poses = Ring(starts).make(pair, seed=0)
+    prior = plain.prior(networks)
+    codes = prior.encode(pair.images)
+    ready = encoded(prior, codes)
+    operations = starts * arithmetic_of(plain, device)[BATCHED].operations
+    memory = held_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
+        exact = gradient(ready, pair, poses)
+    section.note = (
+        f"Zero123's {architecture} size, random weights, {starts} starts, a step is {operations / 1e9:.3g} GFLOP"
+    )
+    for words, computing in computings.items():
+        other = computing.prior(networks)
+        theirs = encoded(other, codes)
+        # The first step: once recorded it takes no more memory.
+        its_memory = held_bytes(partial(gradient, theirs, pair, poses), other.unet, device)
+        off = ((gradient(theirs, pair, poses) - exact).abs().max() / exact.abs().max()).item()
+        peaks = [peak_rate(device, DTYPES[each.dtype]) for each in (computing, plain)]
+        section.note += f"; {words}: gradient off by {off:.1g}, the device's peak {peaks[0] / 1e12:.3g} TFLOP/s"
+        section.facts[words] = {"gradient_deviation": off, "peak_operations_per_second": peaks[0]}
+        label = f"{words}: seconds a step"
+        section.race({label: (batched(theirs, pair, poses, steps), batched(ready, pair, poses, steps))}, rounds)
+        seconds = section.medians()[label]
+        shares = (operations / each / peak for each, peak in zip(seconds, peaks, strict=True))
+        section.add(f"{words}: share of peak", *shares)
+        if device.type == "cuda":
+            section.add(f"{words}: peak memory, GB", its_memory / 1e9, memory / 1e9)
+        del other, theirs
+
+
+def gradient(prior: Prior, pair: Pairs, poses: Tensor) -> Tensor:
+    """Of the energies in the poses `[1, N, 3]`."""
+    energy, poses = PairEnergy(prior, pair, seed=0), poses.detach().clone().requires_grad_()
+    return torch.autograd.grad(energy(poses, TIMESTEP, energy.noise(0)[:, 0]).sum(), poses)[0]
+
+
+def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
+    """So many of the ordered pairs of views, spread evenly over the objects."""
+    every = views.table.pairs("ordered")
+    chosen = every[np.linspace(0, len(every), min(count, len(every)), endpoint=False, dtype=int)]
+    return pairs_of(views[chosen], device)
+
+
+def measure_descent(
+    section: Section, data: PairDataModule, model: PoseModel, prior: Prior, pairs: int, starts: int,
+    gammas: Sequence[float], newton_steps: int, adam_steps: int,
+) -> None:  # fmt: skip
+    """Descents on `pairs` of the test views from where the first stage ends under each of `gammas`.
+
+    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach.
+    """
+    chosen = some_pairs(data.data("test"), pairs, section.device)
+    ready = encoded(prior, prior.encode(chosen.images))
+    newton = GaussNewton(model, ready, refinement_steps=newton_steps, trajectory=True)
+    adam = TwoStage(model, ready, refinement_steps=adam_steps, trajectory=True).second
+    section.note = f"{len(chosen)} pairs of test views, {starts} starts"
+    for gamma in gammas:
+        poses = Ring(starts).make(chosen, seed=0)
+        ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(chosen, poses, seed=0).poses
+        descents = (
+            followed(ready, chosen, newton.refine(chosen, ends, 0), looks=1),
+            followed(ready, chosen, adam.solve(chosen, ends, 0), looks=0),
+        )
+        level = max(min(energies) for energies, _ in descents)
+        steps = [next(step for step, each in enumerate(energies) if each <= level) for energies, _ in descents]
+        reached = [passes[step] for (_, passes), step in zip(descents, steps, strict=True)]
+        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *reached)
+        section.facts[f"gamma {gamma:g}"] = {
+            "energy": {"start": descents[1][0][0], "equal": level},
+            "steps": dict(zip(section.contenders, steps, strict=True)),
+            "energies": {name: each for name, (each, _) in zip(section.contenders, descents, strict=True)},
+        }
+        section.changed()
+
+
+def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
+    """Of a solution with its trajectory, at the start and after each step: energies on the probe, the mean over pairs
+    and starts, and the network passes a start so far. Before its first step it has passed the network `looks` times as
+    often as in each.
+    """
+    path = solution.trajectory
+    assert path is not None  # it was asked for
+    energy = PairEnergy(prior, pairs, PROBE_SEED)
+    timesteps = [timestep for timestep in PROBE_TIMESTEPS for _ in range(PROBE_NOISES)]
+    noise = energy.noise(0, len(timesteps))
+    energies = [energy.mean(poses, timesteps, noise).mean().item() for poses in path.unbind(dim=2)]
+    steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
+    passes = (solution.cost.network_passes - len(pairs.images)) / starts  # the images have been encoded before
+    return energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)]

@@ -16,18 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from lp_framework import registry
-from lp_framework.benchmarks import (
-    adam_gauss_newton,
-    batches,
-    checkpoint,
-    first_stage,
-    precision,
-    rendering,
-    scaling,
-    second_stage,
-)
+from lp_framework.benchmarks import batches, rendering, second_stage, stages, zero123
 from lp_framework.benchmarks.harness import Section
-from lp_framework.benchmarks.zero123 import Computing
 from lp_framework.commands.building import Components, begin, versions
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
@@ -39,14 +29,14 @@ RESULT = "bench.json"
 MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]] = {
     "loader": (batches.measure_loading, batches.LOADING),
     "encoding": (batches.measure_encoding, batches.ENCODING),
-    "first_stage": (first_stage.measure, first_stage.CONTENDERS),
+    "first_stage": (stages.measure_first_stage, stages.FIRST_STAGE),
     "second_stage": (second_stage.measure_step, second_stage.STEP),
     "pair": (second_stage.measure_pair, second_stage.PAIR),
-    "precision": (precision.measure, precision.CONTENDERS),
-    "adam_gauss_newton": (adam_gauss_newton.measure, adam_gauss_newton.CONTENDERS),
+    "precision": (second_stage.measure_precision, second_stage.PRECISION),
+    "adam_gauss_newton": (second_stage.measure_descent, second_stage.DESCENT),
     "rendering": (rendering.measure, rendering.CONTENDERS),
-    "checkpoint": (checkpoint.measure, checkpoint.CONTENDERS),
-    "scaling": (scaling.measure, scaling.CONTENDERS),
+    "checkpoint": (zero123.measure_loading, zero123.LOADING),
+    "scaling": (stages.measure_scaling, stages.SCALING),
 }
 
 
@@ -94,7 +84,7 @@ def arguments(
     """What a measurement takes besides its section: the settings of its name, and objects by theirs."""
     settings = components.settings
     makers: dict[str, Callable[[], object]] = {
-        "computing": lambda: Computing(**_settings(settings, "second_stage", Computing)),
+        "computing": lambda: zero123.Computing(**_settings(settings, "second_stage", zero123.Computing)),
         # The one that ships: figures are to be compared, whatever has been trained here.
         "model": lambda: load_model(SHIPPED / "score").to(device),
         "new_model": lambda: components["model"].to(device),

@@ -113,8 +113,10 @@ def run(config: DictConfig) -> None:
     if trainer.is_global_zero:
         write_result(folder, result, evaluation.metrics, evaluation.table)
         journal.finish()
-        views = data.data(data.evaluation_split())
-        pictures = save_pictures(folder / "pictures", evaluation, views, result) if settings["pictures"] else []
+        pictures = []
+        if settings["pictures"]:
+            shown = data.data(data.evaluation_split())
+            pictures = save_pictures(folder / "pictures", evaluation, shown, result)
         print_results(folder, result, pictures)
 
 
