@@ -113,9 +113,6 @@ def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel) 
     return solver
 
 
-# ---------------------------------------------------------------- photographs as views
-
-
 def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Image.Image:
     """A file, an image of Pillow or an array `[H, W, 3 | 4]` as RGB or RGBA; `name` is what errors call it."""
     if isinstance(picture, str | Path):

@@ -202,9 +202,6 @@ def _store(group: str, choice: str, file: Path | None) -> None:
     ConfigStore.instance().store(choice, values, group, package[1] if package else None, provider="plugin")
 
 
-# ---------------------------------------------------------------- the command line
-
-
 def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     """The overrides and Hydra's options, in any order; `UsageError` for an option that does not exist."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -235,9 +232,6 @@ def _check_experiment(command: str, overrides: Sequence[str]) -> None:
         own = catalogue.experiments(command)
         if experiment not in own and catalogue.find(f"experiment/{experiment}"):
             raise UsageError(f"experiment={experiment} belongs to another command, not to {command} ({_known(own)})")
-
-
-# ---------------------------------------------------------------- errors in one sentence
 
 
 def explain(error: Exception) -> str:

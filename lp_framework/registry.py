@@ -65,9 +65,6 @@ class _State:
 _state = _State()
 
 
-# ---------------------------------------------------------------- registering
-
-
 def register(group: str, name: str) -> Callable[[_Class], _Class]:
     """Class decorator: make the class choosable as `group=name`.
 
@@ -96,9 +93,6 @@ def conf_dir() -> Path:
     """The folder of the built-in configs: inside the package when installed, else beside it in the source tree."""
     inside = Path(__file__).parent / "conf"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "conf"
-
-
-# ---------------------------------------------------------------- looking up
 
 
 def names(group: str) -> list[str]:
@@ -138,9 +132,6 @@ def conf_folders() -> dict[Path, str]:
     """The `conf/` folders that plugins bring, each with its origin, in the order in which the plugins were found."""
     discover()
     return dict(_state.conf_folders)
-
-
-# ---------------------------------------------------------------- building
 
 
 def build(group: str, settings: Mapping[str, Any] | str, **components: object) -> Any:
@@ -215,9 +206,6 @@ def checked(function: Callable[..., Any], values: Mapping[str, Any], prefix: str
                 expected = inspect.formatannotation(hint).replace("collections.abc.", "").replace("typing.", "")
             raise UserError(f"{prefix}{key}={value} does not fit; expected {expected}") from error
     return found
-
-
-# ---------------------------------------------------------------- discovery of plugins
 
 
 def discover(folders: Iterable[str | Path] = ()) -> None:

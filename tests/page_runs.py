@@ -14,7 +14,7 @@ from result_folders import metrics, write_job, write_result
 
 from lp_framework.analysis.examples import EXAMPLES, save_examples
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
-from lp_framework.analysis.shown import ShownPair, View
+from lp_framework.analysis.pairs import ShownPair, View
 from lp_framework.evaluation.tables import PAIR_COLUMNS
 
 NASTY = "</script><img src=x onerror=alert(1)>&_$cup"

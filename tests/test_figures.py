@@ -29,15 +29,14 @@ from lp_framework.analysis.fields import (
     prior_landscapes,
 )
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
-from lp_framework.analysis.pairs import named_pairs, truths
-from lp_framework.analysis.shown import PRIOR_ENERGY, ShownPair, View
+from lp_framework.analysis.pairs import PRIOR_ENERGY, ShownPair, View, named_pairs, truths
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.sets.rendered import MeshData
 from lp_framework.data.source import RenderingsData
 from lp_framework.errors import UserError
-from lp_framework.figures.cameras import CamerasFigure
 from lp_framework.figures.landscapes import FailuresFigure, LandscapesFigure, TrajectoriesFigure
+from lp_framework.figures.results import CamerasFigure
 from lp_framework.geometry import apply_relative_pose, relative_pose
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.solvers.base import Pairs

@@ -13,8 +13,7 @@ from PIL import Image
 from tiny_runs import Commands
 
 from lp_framework.analysis.landscapes import Landscape
-from lp_framework.analysis.pairs import with_solution
-from lp_framework.analysis.shown import ShownPair, View
+from lp_framework.analysis.pairs import ShownPair, View, with_solution
 from lp_framework.data.views import read_views
 from lp_framework.geometry import relative_pose
 from lp_framework.solvers.base import Cost, Solution

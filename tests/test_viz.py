@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from lp_framework.analysis.examples import EXAMPLES, gather_examples, pick_examples, read_examples
 from lp_framework.analysis.fields import ExactModel, grid_poses, model_arrows, model_field
 from lp_framework.analysis.landscapes import Arrows, cell_grid
-from lp_framework.analysis.pairs import in_one_scale
-from lp_framework.analysis.shown import PoseMap, ShownPair, View
+from lp_framework.analysis.pairs import PoseMap, ShownPair, View, in_one_scale
 from lp_framework.commands.eval import save_pictures
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lp_framework.analysis.landscapes import Landscape
-from lp_framework.analysis.shown import PRIOR_ENERGY, PoseMap, ShownPair, View
+from lp_framework.analysis.pairs import PRIOR_ENERGY, PoseMap, ShownPair, View
 from lp_framework.viz.maps import RELIEF, draw_map, pair_figure, surface_figure
 from lp_framework.viz.style import ANSWER, save_figure
 

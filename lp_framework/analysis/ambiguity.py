@@ -32,9 +32,6 @@ PAIRS = 8  # an object, for its ambiguity
 Verdict = Literal["unique", "twofold", "several", "continuous"]
 
 
-# ---------------------------------------------------------------- around an object
-
-
 def azimuth_energies(prior: Prior, pairs: Pairs, poses: Tensor, azimuths: Tensor, draws: Draws) -> Tensor:
     """Energies `[B, A]` at the relative longitudes `azimuths` `[A]` (radians), for B pairs of true `poses` `[B, 3]`.
 
@@ -83,9 +80,6 @@ def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:
     return Profile((degrees.roll(-turned) + 180) % 360 - 180, mean.roll(-turned))
 
 
-# ---------------------------------------------------------------- the ambiguity of an object
-
-
 class Ambiguity(NamedTuple):
     """An object's ambiguity score: `flatness` and the `floor`'s valleys.
 
@@ -130,9 +124,6 @@ def ambiguity(landscapes: Sequence[Landscape], truth: Tensor) -> Ambiguity:
     floor = profile(floors, landscapes[0].longitude.double(), truth.double())
     minima = sum(len(landscape.minima()) for landscape in landscapes) / len(landscapes)
     return Ambiguity(1 - (floor.energy.max() - floor.energy.min()).item(), floor, minima)
-
-
-# ---------------------------------------------------------------- all objects
 
 
 def overview(

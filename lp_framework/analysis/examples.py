@@ -22,8 +22,18 @@ from PIL import Image
 
 from lp_framework.analysis.fields import Draws
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
-from lp_framework.analysis.pairs import shown_pairs, solved_pairs, with_fields, with_model_landscape, with_prior_energy
-from lp_framework.analysis.shown import PRIOR_ENERGY, PoseMap, ShownPair, View, words
+from lp_framework.analysis.pairs import (
+    PRIOR_ENERGY,
+    PoseMap,
+    ShownPair,
+    View,
+    shown_pairs,
+    solved_pairs,
+    with_fields,
+    with_model_landscape,
+    with_prior_energy,
+    words,
+)
 from lp_framework.data.pairs import PairData
 from lp_framework.data.photographs import save_png
 from lp_framework.errors import UserError
@@ -130,9 +140,6 @@ def pick_examples(
             shown.add(index)
             picks[row] = f"worst of {(objects == index).sum()} pairs of {words(names[index])}"
     return {row: picks[row] for row in sorted(picks, key=lambda row: (-failed[row], row))}
-
-
-# ---------------------------------------------------------------- on disk
 
 
 def save_examples(folder: Path, examples: Sequence[ShownPair]) -> None:

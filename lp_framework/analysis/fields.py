@@ -89,9 +89,6 @@ def grid_poses(radius: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
     return torch.cat([angles, radii], dim=-1)
 
 
-# ---------------------------------------------------------------- priors
-
-
 @torch.no_grad()
 def prior_landscapes(prior: Prior, pairs: Pairs, radius: Tensor, grid: Grid, draws: Draws) -> list[Landscape]:
     """A prior's energy over a grid of latitudes and longitudes for B pairs, each at its relative radius of `[B]`."""
@@ -161,9 +158,6 @@ def generated_views(
         parts.append(prior.generate(repeated, pose, steps, guidance, generator, eta).float().cpu())
     views: NDArray = ((torch.cat(parts) + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy()
     return views
-
-
-# ---------------------------------------------------------------- models
 
 
 @torch.no_grad()

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examples
-from lp_framework.analysis.shown import ShownPair
+from lp_framework.analysis.pairs import ShownPair
 from lp_framework.commands.building import (
     Components,
     build_trainer,

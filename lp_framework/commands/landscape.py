@@ -21,8 +21,7 @@ from lp_framework.analysis.ambiguity import NEAR_DEGREES, overview
 from lp_framework.analysis.examples import EXAMPLES, save_examples
 from lp_framework.analysis.fields import Draws, checked_draws
 from lp_framework.analysis.landscapes import landscape_grid
-from lp_framework.analysis.pairs import explained_pair, named_pairs
-from lp_framework.analysis.shown import PoseMap, ShownPair, View, words
+from lp_framework.analysis.pairs import PoseMap, ShownPair, View, explained_pair, named_pairs, words
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, plain, warn_of_photographs
 from lp_framework.data.photographs import on_white, photograph_files, prepared_photographs
@@ -91,9 +90,6 @@ def check(config: DictConfig) -> None:
                 raise UserError(f"{key} is of the landscape of a pair; give object=NAME or images=[A.png,B.png], too")
     if config.object is not None and config.images is not None:
         raise UserError("give object=NAME for views of the data set or images=[A.png,B.png], not both")
-
-
-# ---------------------------------------------------------------- a pair
 
 
 def pair_figures(pair: ShownPair, views: Sequence[NDArray], draws: Draws, heading: str) -> dict[str, Figure]:
@@ -197,9 +193,6 @@ def pair_table(title: str, method: str, record: dict[str, Any]) -> Table:
         place = f"{each['end'][0]:.0f}°", f"{each['end'][1]:.0f}°"
         table.add_row(method if start is None else f"{method} from {start:.0f}°", *place, "", "", off)
     return table
-
-
-# ---------------------------------------------------------------- all objects
 
 
 def overview_table(title: str, record: dict[str, Any]) -> Table:

@@ -14,8 +14,7 @@ from rich.console import Console
 from torch import Tensor
 
 from lp_framework.analysis.fields import generated_views
-from lp_framework.analysis.pairs import object_index
-from lp_framework.analysis.shown import words
+from lp_framework.analysis.pairs import object_index, words
 from lp_framework.api import image_batch
 from lp_framework.commands.building import begin
 from lp_framework.data.module import PairDataModule

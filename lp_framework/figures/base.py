@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from torch import nn
 
 from lp_framework.analysis.fields import checked_draws
-from lp_framework.analysis.pairs import named_pairs
-from lp_framework.analysis.shown import ShownPair
+from lp_framework.analysis.pairs import ShownPair, named_pairs
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import SHIPPED, load_model

@@ -17,7 +17,7 @@ from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from lp_framework.analysis.examples import EXAMPLES, read_examples
-from lp_framework.analysis.shown import words
+from lp_framework.analysis.pairs import words
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import RESULT, summary_rows, write_text
 from lp_framework.report import parts, plots

@@ -18,7 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from numpy.typing import NDArray
 from PIL import Image
 
-from lp_framework.analysis.shown import words
+from lp_framework.analysis.pairs import words
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS

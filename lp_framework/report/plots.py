@@ -20,7 +20,7 @@ from PIL import Image
 from scipy.interpolate import RegularGridInterpolator
 
 from lp_framework.analysis.landscapes import Landscape
-from lp_framework.analysis.shown import ShownPair
+from lp_framework.analysis.pairs import ShownPair
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.geometry import camera_to_world

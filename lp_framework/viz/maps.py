@@ -18,7 +18,7 @@ from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from lp_framework.analysis.landscapes import FLAT, Landscape, LandscapeMinimum
-from lp_framework.analysis.shown import PoseMap, ShownPair
+from lp_framework.analysis.pairs import PoseMap, ShownPair
 from lp_framework.viz.style import ANSWER, DENSITY, FAINT, INK, MAGNITUDE, OTHERS, TRUTH, Sheet, degrees, styled
 
 SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it

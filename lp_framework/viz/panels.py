@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lp_framework.analysis.landscapes import Landscape
-from lp_framework.analysis.shown import PoseMap, ShownPair
+from lp_framework.analysis.pairs import PoseMap, ShownPair
 from lp_framework.viz.maps import draw_map, ends_in_words, minima_in_words, small_marks, small_surface
 from lp_framework.viz.style import ANSWER, ASIDE, INK, Sheet, letter, styled
 
