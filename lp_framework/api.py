@@ -49,14 +49,10 @@ def estimate_pose(
     the prior and the model that it asks for (`model` is weights that ship, a checkpoint, a run's folder or a model)
     on the GPU, where there is one; a built solver has its own.
     """
-    named = [
-        (str(picture) if isinstance(picture, str | Path) else name, picture)
-        for name, picture in (("reference", reference), ("query", query))
-    ]
-    prepared = [
-        prepare(open_picture(picture, name), name, remove_background=remove_background, crop=crop)
-        for name, picture in named
-    ]
+    prepared = []
+    for name, picture in (("reference", reference), ("query", query)):
+        called = str(picture) if isinstance(picture, str | Path) else name
+        prepared.append(prepare(open_picture(picture, called), called, None, remove_background, crop))
     if isinstance(solver, str):
         solver = _build_solver(solver, prior, model)
         move(solver, best_device())

@@ -1,10 +1,8 @@
 """Lets torchvision be imported where its compiled operators do not load.
 
-The CPU build of torch and the torchvision of the package index, which is compiled against a CUDA build, do not fit each
-other: torchvision's extension fails to load, and `import torchvision` then stops at "operator torchvision::nms does not
-exist", because it describes that operator to the compiler. Networks and weights need no such operator. Declaring the
-names of the two that are described is enough; whoever calls one of them still gets torchvision's error.
-
+The extension of the package index's torchvision, compiled against a CUDA build, does not load with the CPU build of
+torch, and `import torchvision` then stops at "operator torchvision::nms does not exist". Networks and weights need no
+operator, so the names of the two that the import describes are declared; calling one still raises torchvision's error.
 Lightning imports torchvision by way of torchmetrics, so `install` sees to it whoever asks for torchvision first.
 """
 
@@ -12,10 +10,10 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-_OPERATORS = ("nms", "qnms")
 _declared: list[Any] = []  # torch.library.Library: a declaration lasts as long as its object
 
 
@@ -38,27 +36,16 @@ def ensure() -> None:
     """Call it before the first `import torchvision`; where torchvision is healthy it changes nothing."""
     if _Watch in sys.meta_path:
         sys.meta_path.remove(_Watch)  # else looking for torchvision would call this again from within
-    if "torchvision" in sys.modules or _declared or _extension_loads():
+    package = None if "torchvision" in sys.modules or _declared else importlib.util.find_spec("torchvision")
+    if package is None or package.origin is None:
         return
     import torch
 
+    with suppress(OSError):
+        for file in Path(package.origin).parent.glob("_C.*"):
+            torch.ops.load_library(file)  # stays loaded, as torchvision's own import would leave it
+            return
     library = torch.library.Library("torchvision", "DEF")
-    for name in _OPERATORS:
+    for name in ("nms", "qnms"):
         library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
     _declared.append(library)
-
-
-def _extension_loads() -> bool:
-    """Whether torchvision's compiled operators load; they stay loaded, as its own import would leave them."""
-    package = importlib.util.find_spec("torchvision")
-    if package is None or package.origin is None:
-        return True  # not installed: nothing to mend
-    import torch
-
-    try:
-        for file in Path(package.origin).parent.glob("_C.*"):
-            torch.ops.load_library(file)
-            return True
-    except OSError:
-        pass
-    return False

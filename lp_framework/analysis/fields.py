@@ -137,15 +137,9 @@ def prior_field(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Fiel
 
 @torch.no_grad()
 def generated_views(
-    prior: Prior,
-    source: ViewCode,
-    poses: Tensor,
-    steps: int,
-    guidance: float,
-    seed: int,
-    eta: float = 1.0,
-    batch: int = 16,
-) -> NDArray:
+    prior: Prior, source: ViewCode, poses: Tensor, steps: int, guidance: float, seed: int,
+    eta: float = 1.0, batch: int = 16,
+) -> NDArray:  # fmt: skip
     """Views `[N, H, W, 3]` in [0, 1] of one image's code under relative poses `[N, 3]`, by DDIM, `batch` at once.
 
     All have the same draws, so that they differ by their poses alone.

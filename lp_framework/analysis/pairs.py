@@ -17,15 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.analysis.fields import (
-    Draws,
-    ExactModel,
-    generated_views,
-    model_arrows,
-    model_field,
-    model_landscapes,
-    prior_landscapes,
-)
+from lp_framework.analysis import fields
 from lp_framework.analysis.landscapes import Arrows, Grid, Landscape, landscape_grid
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairData
@@ -111,8 +103,7 @@ class ShownPair:
         sound = np.isfinite(self.ends).all(axis=-1)
         lost = self.chosen is None or not sound[self.chosen]
         names = ("starts", "trajectories", "ends", "energies", "rotation_errors", "translation_errors")
-        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        kept: dict[str, Any] = {name: each[sound] for name, each in known.items()}
+        kept: dict[str, Any] = {name: each[sound] for name in names if (each := getattr(self, name)) is not None}
         return replace(self, chosen=None if lost else int(sound[: self.chosen].sum()), **kept)
 
 
@@ -239,19 +230,18 @@ def recording(solver: Solver) -> Solver:
 
 
 def with_prior_energy(
-    pairs: Pairs, shown: Sequence[ShownPair], prior: Prior, draws: Draws, grid: Grid | None = None
+    pairs: Pairs, shown: Sequence[ShownPair], prior: Prior, draws: fields.Draws, grid: Grid | None = None
 ) -> list[ShownPair]:
     """The pairs with the prior's landscape, on the paper's grid unless given, at the true relative radii or at 0."""
     radius = torch.tensor([0.0 if pair.truth is None else float(pair.truth[2]) for pair in shown])
-    return _with_landscapes(
-        shown, PRIOR_ENERGY, prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws)
-    )
+    found = fields.prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws)
+    return _with_landscapes(shown, PRIOR_ENERGY, found)
 
 
 def with_model_landscape(pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel) -> list[ShownPair]:
     """The pairs with `model_landscapes` at their true relative radii."""
     name = "energy of the model" if model.has_energy else "length of the model's score"
-    return _with_landscapes(shown, name, model_landscapes(model, pairs, truths(shown)[:, 2], landscape_grid()))
+    return _with_landscapes(shown, name, fields.model_landscapes(model, pairs, truths(shown)[:, 2], landscape_grid()))
 
 
 def _with_landscapes(shown: Sequence[ShownPair], name: str, found: Sequence[Landscape]) -> list[ShownPair]:
@@ -259,20 +249,15 @@ def _with_landscapes(shown: Sequence[ShownPair], name: str, found: Sequence[Land
 
 
 def with_fields(
-    pairs: Pairs,
-    shown: Sequence[ShownPair],
-    model: PoseModel,
-    solved: Sequence[ShownPair],
-    first_stage: Langevin | None,
-    starts: Tensor,
-    seed: int,
-) -> list[ShownPair]:
+    pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel, solved: Sequence[ShownPair],
+    first_stage: Langevin | None, starts: Tensor, seed: int,
+) -> list[ShownPair]:  # fmt: skip
     """The pairs with two maps each, in one scale: the model's field, and the exact one, the best there is to learn.
 
     An energy model has exp(-E) below it. Over the first are the ways of the pairs as they were `solved`, over the
     second those of `first_stage` with the exact field in the model's place, where there is one.
     """
-    exact = ExactModel(model.kernel, truths(shown), model.has_energy)
+    exact = fields.ExactModel(model.kernel, truths(shown), model.has_energy)
     ideal: Sequence[ShownPair | None] = [None] * len(shown)
     if first_stage is not None:
         guided = copy.copy(first_stage)
@@ -283,8 +268,10 @@ def with_fields(
     for each, title, ways in ((model, f"Learned {name}", solved), (exact, f"Exact {name} (oracle)", ideal)):
         densities: Sequence[Landscape | None] = [None] * len(shown)
         if each.has_energy:
-            densities = [landscape.density() for landscape in model_landscapes(each, pairs, radius, DENSITY_GRID)]
-        arrows = model_arrows(each, pairs, radius, ARROW_SPACING)
+            densities = [
+                landscape.density() for landscape in fields.model_landscapes(each, pairs, radius, DENSITY_GRID)
+            ]
+        arrows = fields.model_arrows(each, pairs, radius, ARROW_SPACING)
         parts = zip(densities, arrows, ways, strict=True)
         maps.append([PoseMap(f"{title}, at the true relative radius", None, *part) for part in parts])
     return [replace(pair, maps=in_one_scale(own)) for pair, *own in zip(shown, *maps, strict=True)]
@@ -297,32 +284,25 @@ def in_one_scale(maps: Sequence[PoseMap]) -> list[PoseMap]:
 
 
 def explained_pair(
-    pairs: Pairs,
-    pair: ShownPair,
-    solver: Solver,
-    prior: Prior,
-    model: PoseModel | None,
-    starts: Tensor,
-    draws: Draws,
-    grid: Grid,
-) -> tuple[ShownPair, list[NDArray], FieldValue | None]:
+    pairs: Pairs, pair: ShownPair, solver: Solver, prior: Prior, model: PoseModel | None,
+    starts: Tensor, draws: fields.Draws, grid: Grid,
+) -> tuple[ShownPair, list[NDArray], FieldValue | None]:  # fmt: skip
     """One pair, solved once, with those starts alone that came to a pose; what the prior generates at the ends,
     `[N, H, W, 3]`; and the model's field on the landscape's grid, where there is a model.
 
     The maps are of the first stage without noise, over the model's field and over the exact one. Photographs, whose
     truth is not known, have none.
     """
-    seed, field = draws.seed, None
-    (pair,) = with_prior_energy(pairs, [pair], prior, draws, grid)
-    (pair,) = solved_pairs(pairs, [pair], solver, starts, seed)
-    pair, views = pair.arrived(), []
+    seed, field, views = draws.seed, None, []
+    (pair,) = solved_pairs(pairs, with_prior_energy(pairs, [pair], prior, draws, grid), solver, starts, seed)
+    pair = pair.arrived()
     if pair.trajectories is not None:  # the same poses, with longitudes unreduced
         pair = replace(pair, ends=pair.trajectories[:, -1])
     if len(pair.ends):
         source = prior.encode(pairs.images[pairs.reference])
-        views = list(generated_views(prior, source, torch.from_numpy(pair.ends), *SAMPLING, seed))
+        views = list(fields.generated_views(prior, source, torch.from_numpy(pair.ends), *SAMPLING, seed))
     if model is not None and pair.truth is not None:
-        field = model_field(model, pairs, truths([pair])[:, 2], grid)
+        field = fields.model_field(model, pairs, truths([pair])[:, 2], grid)
         first_stage = Langevin(model, gamma=0.0)
         solved = solved_pairs(pairs, [pair], first_stage, starts, seed)
         (pair,) = with_fields(pairs, [pair], model, solved, first_stage, starts, seed)

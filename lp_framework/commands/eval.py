@@ -19,30 +19,12 @@ from rich.console import Console
 
 from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examples
 from lp_framework.analysis.pairs import ShownPair
-from lp_framework.commands.building import (
-    Components,
-    build_trainer,
-    plain,
-    run_folder,
-    seed_run,
-    versions,
-    warn_of_unused,
-    weights_fingerprint,
-    with_overrides,
-)
+from lp_framework.commands import building
 from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError
+from lp_framework.evaluation import journal
 from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.evaluation.journal import (
-    FOLDER,
-    MOVABLE,
-    Journal,
-    compared_settings,
-    differences,
-    goes_on,
-    unfinished,
-)
 from lp_framework.evaluation.tables import RESULT, summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint
 from lp_framework.report.page import write_run_page
@@ -62,35 +44,35 @@ def run(config: DictConfig) -> None:
 
     With `resume` it is the folder of an evaluation that was stopped.
     """
-    folder, checkpoint = run_folder(), None
+    folder, checkpoint = building.run_folder(), None
     if config.resume is not None:
         folder = Path(config.resume)
         config, checkpoint = unfinished_evaluation(folder, config)
-    settings = plain(config)
+    settings = building.plain(config)
     if settings["trainer"].get("precision", "32-true") != "32-true":
         raise UserError("trainer.precision: poses are computed in float32; prior.dtype=bfloat16 is Zero123's own")
     if not isinstance(settings["pictures"], bool):
         raise UserError(f"pictures must be true or false, got {settings['pictures']}")
-    seed_run(settings["seed"])
-    components = Components(settings, checkpoint)
+    building.seed_run(settings["seed"])
+    components = building.Components(settings, checkpoint)
     if "model" in components.needs("solver") and checkpoint is None:
         components.checkpoint = find_checkpoint(settings["checkpoint"])
     if settings["resume"] is None and is_finished(folder, settings, components.checkpoint):
         return
-    warn_of_unused(components)
+    building.warn_of_unused(components)
     solver, starts, data = components["solver"], components["start"], components["data"]
     subject = {
         "config": json.loads(json.dumps(settings)),
         "checkpoint": str(components.checkpoint) if components.checkpoint else None,
-        "weights": weights_fingerprint(solver.networks()),
-        "versions": versions(),
+        "weights": building.weights_fingerprint(solver.networks()),
+        "versions": building.versions(),
     }
-    before = unfinished(folder) if goes_on(folder, subject) else None
-    journal = Journal(folder, subject)
-    trainer = build_trainer(settings["trainer"], folder, [RichProgressBar(leave=False)], logger=[])
+    before = journal.unfinished(folder) if journal.goes_on(folder, subject) else None
+    kept = journal.Journal(folder, subject)
+    trainer = building.build_trainer(settings["trainer"], folder, [RichProgressBar(leave=False)], logger=[])
     batch_pairs = pairs_at_once(settings["batch_pairs"], solver, starts)
     seed, views, protocol = settings["seed"], settings["views"], settings["protocol"]
-    evaluation = Evaluation(solver, starts, seed, journal, views)
+    evaluation = Evaluation(solver, starts, seed, kept, views)
     if views is None:
         data.evaluate_on(protocol, seed, batch_pairs)
     elif protocol != "ordered":
@@ -112,7 +94,7 @@ def run(config: DictConfig) -> None:
         result["versions_before"] = before["versions"]  # of what was solved before it was stopped
     if trainer.is_global_zero:
         write_result(folder, result, evaluation.metrics, evaluation.table)
-        journal.finish()
+        kept.finish()
         pictures = []
         if settings["pictures"]:
             shown = data.data(data.evaluation_split())
@@ -132,12 +114,12 @@ def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | No
     file = folder / RESULT
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
-        previous = compared_settings(result["config"])
+        previous = journal.compared_settings(result["config"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
     before = {**previous, "checkpoint": result.get("checkpoint")}
-    now = {**compared_settings(json.loads(json.dumps(settings))), "checkpoint": checkpoint and str(checkpoint)}
-    changed = differences(before, now)
+    now = {**journal.compared_settings(json.loads(json.dumps(settings))), "checkpoint": checkpoint and str(checkpoint)}
+    changed = journal.differences(before, now)
     advice = "give another hydra.sweep.dir, or remove it"
     if changed:
         said = ", ".join(f"{key} is {there} there, {here} here" for key, (there, here) in list(changed.items())[:3])
@@ -155,14 +137,14 @@ def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig,
     """
     if (folder / RESULT).is_file():
         raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
-    subject = unfinished(folder)
+    subject = journal.unfinished(folder)
     if subject is None:
-        raise UserError(f"resume={folder}: holds no {FOLDER} evaluation to go on from; give the folder of one")
+        raise UserError(f"resume={folder}: holds no {journal.FOLDER} evaluation to go on from; give the folder of one")
     previous = OmegaConf.create(subject["config"])
     if missing := sorted({*config} - {*previous}):
         raise UserError(f"resume={folder}: is of another version of lp_framework, without {missing[0]}; evaluate anew")
     checkpoint = Path(subject["checkpoint"]) if subject["checkpoint"] else None
-    return with_overrides(previous, config, MOVABLE, folder / FOLDER), checkpoint
+    return building.with_overrides(previous, config, journal.MOVABLE, folder / journal.FOLDER), checkpoint
 
 
 def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:

@@ -27,16 +27,7 @@ from rich.console import Console
 from yaml import YAMLError
 
 from lp_framework import catalogue, registry
-from lp_framework.commands.building import (
-    TRAINING,
-    Components,
-    build_trainer,
-    plain,
-    run_folder,
-    seed_run,
-    versions,
-    with_overrides,
-)
+from lp_framework.commands import building
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
@@ -51,7 +42,7 @@ OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects",
 
 def run(config: DictConfig) -> None:
     """Train into this run's folder, or go on in the folder that `resume` names, or where this very run was stopped."""
-    folder = run_folder() if config.resume is None else Path(config.resume)
+    folder = building.run_folder() if config.resume is None else Path(config.resume)
     saved = folder / "config.yaml"
     begun = any((folder / FOLDER / name).is_file() for name in (LAST, BEST))
     last, checkpoint = None, None
@@ -65,7 +56,7 @@ def run(config: DictConfig) -> None:
                 "validation; train anew"
             )
         # A run may be prolonged or moved to other devices.
-        config = with_overrides(before, config, ("trainer",), saved)
+        config = building.with_overrides(before, config, ("trainer",), saved)
     elif begun and _saved_config(saved, config) != config:  # what was learned is not overwritten
         raise UserError(
             f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
@@ -75,21 +66,23 @@ def run(config: DictConfig) -> None:
     if begun:
         last, checkpoint = last_checkpoint(folder)
         epochs = config.trainer.max_epochs
-        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and (folder / TRAINING).is_file():
+        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and (folder / building.TRAINING).is_file():
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 print(f"skipped, finished before: {folder}")
                 return
             raise UserError(
                 f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it"
             )
-    recipe = {"model": plain(config.model), "backbone": plain(config.backbone)}
-    seed_run(config.seed)
-    components = Components(plain(config))
+    recipe = {"model": building.plain(config.model), "backbone": building.plain(config.backbone)}
+    building.seed_run(config.seed)
+    components = building.Components(building.plain(config))
     data, model = components["data"], components["model"]
     model.recipe = recipe
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
-    trainer = build_trainer(plain(config.trainer), folder, callbacks(config, folder), loggers(config, folder))
+    trainer = building.build_trainer(
+        building.plain(config.trainer), folder, callbacks(config, folder), loggers(config, folder)
+    )
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
         if checkpoint is not None:
@@ -189,10 +182,10 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
     write_json(
-        folder / TRAINING,
+        folder / building.TRAINING,
         {**recipe, "seed": config.seed, "epochs": trainer.current_epoch, "steps": trainer.global_step,
          "final": losses, "objects": data.table("train").names,
-         "fingerprints": {"views": data.fingerprint("all_train")}, "versions": versions()},
+         "fingerprints": {"views": data.fingerprint("all_train")}, "versions": building.versions()},
     )  # fmt: skip
     if len(finite) < len(losses):
         diverged = ", ".join(sorted({*losses} - {*finite}))
@@ -203,4 +196,4 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
     for picture in save_training_picture(folder):
         console.print(f"picture: {picture}")
     console.print(f"page:    {write_run_page(folder, 'train')}")
-    console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)), plain(config.data))}")
+    console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)), building.plain(config.data))}")
