@@ -59,10 +59,10 @@ class UsageError(UserError):
 
 
 def run(command: str, arguments: Sequence[str]) -> None:
-    """Compose `conf/COMMAND.yaml` with the arguments (overrides and Hydra's options), and run the command with it.
+    """Compose `conf/COMMAND.yaml` with the arguments, and call `lp_framework.commands.COMMAND.run(config)` with it.
 
-    The command is `lp_framework.commands.COMMAND.run(config)`, imported only when it runs. Raises `UsageError` for
-    arguments that do not compose, `UserError` for bad input met while running; in a sweep the other jobs go on first.
+    Raises `UsageError` for arguments that do not compose, `UserError` for bad input met while running; in a sweep the
+    other jobs go on first.
     """
     overrides, options = _parse(arguments)
     registry.discover(catalogue.plugin_folders(overrides))

@@ -3,17 +3,15 @@
 The typed arguments of a class's constructor are its settings. An argument that bears the name of a group (`prior`,
 `model`, `backbone`, ...) is a *component*: an object of that group that the caller builds and passes, never a setting.
 
-Classes come from three places:
+Built-in classes are in the packages of `GROUPS`, imported when a class of the group is asked for; others are in
 
-- *built-in*: the packages of `GROUPS`, imported when a class of the group is asked for; `conf/GROUP/NAME.yaml` holds
-  the settings of each;
 - *packages* with an entry point in the group `lp_framework.plugins`, whose value is a module to import;
 - *folders*: `plugins/` of the working directory and those given to `discover`. A folder that holds Python files or a
   pyproject.toml is one plugin; any other folder is searched for plugins one level down.
 
 A plugin's modules are imported under their own names, with its folder at the end of `sys.path`, so that worker
-processes can unpickle its classes. A plugin that fails to import is kept in `failures()` with its error, and the rest
-load. A `conf/` folder beside a module of a plugin (inside it, if it is a package) is listed in `conf_folders()`.
+processes can unpickle its classes. A `conf/` folder beside a module of a plugin (inside it, if it is a package) holds
+choices of its own.
 """
 
 from __future__ import annotations
@@ -53,12 +51,10 @@ _Class = TypeVar("_Class", bound=type)
 
 @dataclass
 class _State:
-    """What has been found so far."""
-
     classes: dict[Key, tuple[type, str]] = field(default_factory=dict)  # with their origins
     conf_folders: dict[Path, str] = field(default_factory=dict)  # with their origins
     failures: dict[str, str] = field(default_factory=dict)  # by origin
-    seen: set[str] = field(default_factory=set)  # where has been looked already
+    seen: set[str | Path] = field(default_factory=set)  # where has been looked already
     loading: str | None = None  # origin of the plugin being imported
 
 
@@ -215,41 +211,36 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
     """
     if _state.loading is not None:  # a plugin that asks for names while it is being imported
         return
-    if _first_time(ENTRY_POINTS):
+    if ENTRY_POINTS not in _state.seen:
+        _state.seen.add(ENTRY_POINTS)
         for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
             package = f"{point.dist.name} {point.dist.version}" if point.dist else point.name
             with _guarded(f"package {package}"):
                 _import(point.module)
-    for plugin in _plugins(Path("plugins")):
-        _load_plugin(plugin)
-    for folder in map(Path, folders):
+    named = [Path(folder) for folder in folders]
+    for folder in (Path("plugins"), *named):
         plugins = _plugins(folder)
-        if not plugins:
+        if not plugins and folder in named:
             raise UserError(f"plugins=[{folder}]: is no folder with Python files, nor holds one (below {Path.cwd()})")
         for plugin in plugins:
             _load_plugin(plugin)
 
 
-def _first_time(place: str) -> bool:
-    first = place not in _state.seen
-    _state.seen.add(place)
-    return first
-
-
 def _plugins(folder: Path) -> list[Path]:
     """The folder itself where it is a plugin, otherwise the plugins one level down."""
-    return [folder] if _is_plugin(folder) else sorted(filter(_is_plugin, folder.glob("*")))
 
+    def is_plugin(place: Path) -> bool:
+        return place.is_dir() and ((place / "pyproject.toml").exists() or any(place.glob("*.py")))
 
-def _is_plugin(folder: Path) -> bool:
-    return folder.is_dir() and ((folder / "pyproject.toml").exists() or any(folder.glob("*.py")))
+    return [folder] if is_plugin(folder) else sorted(filter(is_plugin, folder.glob("*")))
 
 
 def _load_plugin(folder: Path) -> None:
     """Import the modules and packages of a plugin's folder; of a folder that is a package, only that package."""
     place = folder.resolve()
-    if not _first_time(str(place)):
+    if place in _state.seen:
         return
+    _state.seen.add(place)
     files = [*place.glob("*.py"), *place.glob("*/__init__.py")]
     if (place / "__init__.py").exists():
         place, files = place.parent, [place / "__init__.py"]
