@@ -16,10 +16,9 @@ from view_folders import write_objects
 from zero123_checkpoint import state_dict, write_checkpoint
 
 from lp_framework import registry
-from lp_framework.benchmarks import batches, counting, harness, rendering, second_stage, zero123
+from lp_framework.benchmarks import batches, harness, rendering, second_stage, zero123
 from lp_framework.benchmarks.batches import loss_on, trunk_features
-from lp_framework.benchmarks.counting import counted, launched, peak_bytes
-from lp_framework.benchmarks.harness import Section
+from lp_framework.benchmarks.harness import Section, counted, launched, peak_bytes
 from lp_framework.benchmarks.second_stage import BATCHED, LOOP, Arithmetic, arithmetic_of, followed, some_pairs, variant
 from lp_framework.benchmarks.stages import all_pairs, exponent, plain_loop
 from lp_framework.benchmarks.zero123 import (
@@ -283,7 +282,7 @@ def test_a_step_has_as_many_operations_as_starts_and_its_launches_do_not_depend_
 
 
 def test_the_rate_of_a_matrix_product_is_positive():
-    assert counting.peak_rate(CPU, torch.float32) > 1e8
+    assert harness.peak_rate(CPU, torch.float32) > 1e8
 
 
 def test_peak_memory_is_that_of_tensors_alive_at_once():

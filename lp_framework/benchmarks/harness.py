@@ -1,13 +1,21 @@
-"""The harness of `bench`: two contenders at the same work, alternated round by round within one run."""
+"""The harness of `bench`: two contenders at the same work, alternated round by round within one run.
+
+Besides time it knows what a piece of work takes of operations, launches of kernels, and memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, TypeVar
 
 import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
 
 from lp_framework.clock import now
 
@@ -80,3 +88,83 @@ def timed(work: Callable[[], _Result], device: torch.device) -> tuple[float, _Re
     began = now(device)
     result = work()
     return now(device) - began, result
+
+
+def counted(work: Callable[[], object]) -> int:
+    """Floating-point operations of the matrix products, convolutions and attentions in a piece of work.
+
+    Their number depends on shapes alone: tensors on the meta device do, on which nothing is computed.
+    """
+    with FlopCounterMode(display=False) as counter:
+        work()
+    return int(counter.get_total_flops())
+
+
+def peak_rate(device: torch.device, dtype: torch.dtype) -> float:
+    """Operations a second of the fastest of a few products of square matrices."""
+    side = 8192 if device.type == "cuda" else 1024
+    matrix = torch.randn(side, side, device=device).to(dtype)
+    matrix @ matrix
+    return 2 * side**3 / min(timed(lambda: matrix @ matrix, device)[0] for _ in range(5))
+
+
+def launched(work: Callable[[], object]) -> int:
+    """Operators in a piece of work that compute something, each at least one launch of a kernel on a GPU.
+
+    Views and memory that is only taken do not count.
+    """
+    with _Operators() as operators:
+        work()
+    return operators.launches
+
+
+def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
+    """Bytes that the tensors made by some work take at most at once, beyond those that were there before.
+
+    On a GPU PyTorch's allocator counts; on a CPU, where nobody does, every operation's results are followed until they
+    are gone (which takes time: do not clock it). What a kernel needs for itself is in the first alone.
+    """
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        work()
+        torch.cuda.synchronize(device)
+        return torch.cuda.max_memory_allocated(device) - before
+    with _Operators() as operators:
+        work()
+    return operators.peak
+
+
+class _Operators(TorchDispatchMode):
+    """Counts operators, and the bytes of the storages that they make, from their making to their end."""
+
+    FREE = ("aten::_unsafe_view", "aten::empty", "aten::new_empty")  # and what begins so: launches nothing
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.launches = self.now = self.peak = 0
+        self.alive: dict[int, int] = {}
+
+    def __torch_dispatch__(
+        self, function: Any, types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        self.launches += not (function.is_view or function.name().startswith(self.FREE))
+        arguments = {*_storages((args, kwargs))}
+        result = function(*args, **(kwargs or {}))
+        for key, storage in _storages(result).items():
+            if key not in self.alive and key not in arguments:  # else a view, or changed in place
+                self.alive[key] = storage.nbytes()
+                self.now += storage.nbytes()
+                weakref.finalize(storage, self._end, key)
+        self.peak = max(self.peak, self.now)
+        return result
+
+    def _end(self, key: int) -> None:
+        self.now -= self.alive.pop(key)
+
+
+def _storages(tree: Any) -> dict[int, torch.UntypedStorage]:
+    """The memory of the tensors in nested containers, by its address in PyTorch."""
+    storages = [leaf.untyped_storage() for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
+    return {storage._cdata: storage for storage in storages}

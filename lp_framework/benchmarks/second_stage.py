@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.counting import counted, launched, peak_rate
-from lp_framework.benchmarks.harness import Section, timed, worth
+from lp_framework.benchmarks.harness import Section, counted, launched, peak_rate, timed, worth
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
     Architecture,

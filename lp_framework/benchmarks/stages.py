@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.counting import peak_bytes
-from lp_framework.benchmarks.harness import Section, Work, timed, worth
+from lp_framework.benchmarks.harness import Section, Work, peak_bytes, timed, worth
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior

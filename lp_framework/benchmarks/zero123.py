@@ -13,8 +13,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor, nn
 
-from lp_framework.benchmarks.counting import peak_bytes
-from lp_framework.benchmarks.harness import Section, Work, worth
+from lp_framework.benchmarks.harness import Section, Work, peak_bytes, worth
 from lp_framework.priors.base import Prior, ViewCode
 from lp_framework.priors.zero123.networks import (
     DTYPES,
