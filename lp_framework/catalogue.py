@@ -76,7 +76,10 @@ def read(path: str, config_dir: str | None = None) -> ConfigFile:
     name = own.settings.get("name", [choice])[0].removeprefix("name: ")
     below, entries = ConfigFile(), own.defaults
     if (group, name) in registry.plugin_classes():
-        below = _signature(group, name)
+        cls, _ = registry.plugin_classes()[group, name]
+        values = {key: "null" if value is None else value for key, value in plugin_defaults(cls).items()}
+        lines = {key: [f"{key}: {value}"] for key, value in {"name": name, **values}.items()}
+        below = ConfigFile((cls.__doc__ or "").strip().partition("\n")[0], settings=lines)
         entries = [*([SHARED[group]] if group in SHARED else []), *entries]
     for entry in entries:
         if isinstance(entry, dict):  # {/loader@_here_: pairs}
@@ -106,14 +109,6 @@ def parse(text: str) -> ConfigFile:
     defaults = yaml.safe_load("\n".join(parts.settings.pop("defaults", []))) or {}
     parts.defaults = defaults.get("defaults") or []
     return parts
-
-
-def _signature(group: str, name: str) -> ConfigFile:
-    """A plugin's class as text: the first line of its docstring, and the defaults of its constructor."""
-    cls, _ = registry.plugin_classes()[group, name]
-    values = {key: "null" if value is None else value for key, value in plugin_defaults(cls).items()}
-    lines = {key: [f"{key}: {value}"] for key, value in {"name": name, **values}.items()}
-    return ConfigFile((cls.__doc__ or "").strip().partition("\n")[0], settings=lines)
 
 
 def plugin_defaults(cls: type) -> dict[str, Any]:

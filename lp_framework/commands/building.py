@@ -8,7 +8,6 @@ import logging
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +53,7 @@ class Components:
 
     def __getitem__(self, group: str) -> Any:
         if group not in self._built:
-            trained = group == "model" and group not in self.settings
-            self._built[group] = self._trained_model() if trained else self._build(group)
+            self._built[group] = self._build(group)
         return self._built[group]
 
     def needs(self, group: str) -> list[str]:
@@ -74,23 +72,19 @@ class Components:
         return {"seed": self.settings["seed"], "config": self.settings, "versions": versions()}
 
     def _build(self, group: str) -> Any:
-        build = build_data if group == "data" else partial(registry.build, group)
-        return build(self.settings[group], **{each: self[each] for each in self.needs(group)})
-
-    def _trained_model(self) -> nn.Module:
-        if self.checkpoint is None:
-            self.checkpoint = find_checkpoint(self.settings["checkpoint"])
-        rank_zero_only(print)(f"model: {describe(self.checkpoint)}")
-        return load_model(self.checkpoint)
-
-
-def build_data(settings: Mapping[str, Any], **components: object) -> PairDataModule:
-    """The data module of the source that `settings` name; they are those of both."""
-    loader, _ = registry.parameters(PairDataModule)
-    own = {key: value for key, value in settings.items() if key not in loader}
-    shared = {key: value for key, value in settings.items() if key in loader}
-    source: ViewSource = registry.build("data", own, **components)
-    return PairDataModule(source, **registry.checked(PairDataModule.__init__, shared, "data."))
+        if group == "model" and group not in self.settings:
+            if self.checkpoint is None:
+                self.checkpoint = find_checkpoint(self.settings["checkpoint"])
+            rank_zero_only(print)(f"model: {describe(self.checkpoint)}")
+            return load_model(self.checkpoint)
+        settings, components = self.settings[group], {each: self[each] for each in self.needs(group)}
+        if group != "data":
+            return registry.build(group, settings, **components)
+        loader, _ = registry.parameters(PairDataModule)  # the settings are its own and those of the source of views
+        own = {key: value for key, value in settings.items() if key not in loader}
+        shared = {key: value for key, value in settings.items() if key in loader}
+        source: ViewSource = registry.build("data", own, **components)
+        return PairDataModule(source, **registry.checked(PairDataModule.__init__, shared, "data."))
 
 
 def warn_of_unused(components: Components) -> None:

@@ -17,7 +17,6 @@ from lp_framework.analysis.fields import generated_views
 from lp_framework.analysis.pairs import object_index, words
 from lp_framework.api import image_batch
 from lp_framework.commands.building import begin
-from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_json
@@ -28,7 +27,6 @@ from lp_framework.viz.sheets import views_figure
 from lp_framework.viz.style import save_figure
 
 FOLDER = "views"
-Source = tuple[Path, str, Image.Image]  # what is turned: its file, its name, and the prepared image (RGBA)
 
 
 def run(config: DictConfig) -> None:
@@ -36,7 +34,13 @@ def run(config: DictConfig) -> None:
     folder, device, components = begin(config)
     latitudes, longitudes = angles(config.latitudes_degrees, config.longitudes)
     sampling = checked(Prior.generate, {key: config[key] for key in ("steps", "guidance", "eta")}, "")
-    file, name, image = photograph(config) if config.image is not None else data_view(config, components.test_views())
+    if config.image is not None:
+        file, name = Path(config.image), Path(config.image).name
+        (image,) = prepared_photographs([file], config.masks, config.remove_background, config.crop)
+    else:  # the first test view of an object, as it is
+        data, name = components.test_views(), words(config.object)
+        file = data.table("test").objects[object_index(data, str(config.object))].files[0]
+        image = prepare(read_image(file), str(file), crop=False)
     prior: Prior = components["prior"].to(device)
     poses = grid(latitudes, longitudes)  # [rows, columns, 3]
     code, columns = prior.encode(image_batch([image]).to(device)), poses.transpose(0, 1).flatten(0, 1)
@@ -85,19 +89,6 @@ def grid(latitudes: Sequence[float], longitudes: Sequence[float]) -> Tensor:
     degrees = torch.cartesian_prod(*(torch.tensor(each, dtype=torch.float64) for each in (latitudes, longitudes)))
     poses = torch.cat([torch.deg2rad(degrees), torch.zeros(len(degrees), 1)], dim=1)
     return poses.float().view(len(latitudes), len(longitudes), 3)
-
-
-def photograph(config: DictConfig) -> Source:
-    """The file that `image` names, prepared as a photograph is."""
-    file = Path(config.image)
-    (image,) = prepared_photographs([file], config.masks, config.remove_background, config.crop)
-    return file, file.name, image
-
-
-def data_view(config: DictConfig, data: PairDataModule) -> Source:
-    """The first test view of the data set's `object`, as it is."""
-    file = data.table("test").objects[object_index(data, str(config.object))].files[0]
-    return file, words(config.object), prepare(read_image(file), str(file), crop=False)
 
 
 def file_name(latitude: float, longitude: float) -> str:
