@@ -60,10 +60,7 @@ class Profile(NamedTuple):
         return ((self.energy.max() - self.energy.min()) / self.energy.mean()).item()
 
     def minima(self) -> list[dict[str, float]]:
-        """Its local minima, the deepest first: `degrees` from the truth, and `height` in the profile's range.
-
-        A dent of less than `PROMINENCE` of the range does not count.
-        """
+        """Its local minima, the deepest first: `degrees` from the truth, and `height` in the profile's range."""
         found = valleys(self.energy[None], PROMINENCE)
         return [{"degrees": self.degrees[cell].item(), "height": height} for cell, height, _ in found]
 
@@ -81,10 +78,9 @@ def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:
 
 
 class Ambiguity(NamedTuple):
-    """An object's ambiguity score: `flatness` and the `floor`'s valleys.
+    """An object's ambiguity: `flatness`, 1 less the range of the `floor`, is 1 where all longitudes are equally good.
 
-    `flatness` is 1 less the range of the mean valley floor: 1 where all longitudes are equally good. `floor` is that
-    floor over degrees from the truth; `minima` the mean number of minima of a pair's whole landscape.
+    `floor` is the mean valley floor over degrees from the truth, `minima` the mean number of a pair's whole landscape.
     """
 
     flatness: float
@@ -131,8 +127,8 @@ def overview(
 ) -> dict[str, Any]:
     """`objects`, a row an object, and the shares of pairs whose least energy is at the truth, as plain values.
 
-    `azimuths` of them around each pair of the protocol, on which the data evaluate, with latitude and radius true; the
-    ambiguity by landscapes over `grid` of up to `PAIRS` pairs of the protocol `per_view`.
+    `azimuths` are tried around each pair of the protocol, on which the data evaluate; the ambiguity is by landscapes
+    over `grid` of up to `PAIRS` pairs of the protocol `per_view`.
     """
     split = data.evaluation_split()
     table, views = data.table(split), data.data(split)
@@ -161,11 +157,10 @@ def overview(
                 "ambiguity_score": ambiguity(landscapes, true[:, 1]).record(),
             }
         )  # fmt: skip
+
+    def share(some: list[dict[str, Any]]) -> float | None:
+        pairs = sum(row["pairs"] for row in some)
+        return sum(row["within"] * row["pairs"] for row in some) / pairs if pairs else None
+
     unique = [row for row in rows if row["unique_answer"]]
-    return {"objects": rows, "within": _share(rows), "within_unique_answer": _share(unique)}
-
-
-def _share(rows: list[dict[str, Any]]) -> float | None:
-    """The share of pairs within the limit, over the objects of `rows`."""
-    pairs = sum(row["pairs"] for row in rows)
-    return sum(row["within"] * row["pairs"] for row in rows) / pairs if pairs else None
+    return {"objects": rows, "within": share(rows), "within_unique_answer": share(unique)}

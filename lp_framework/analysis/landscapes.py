@@ -1,7 +1,6 @@
 """Landscapes over relative latitude and longitude as plain arrays, their valleys, and what is mapped beside them.
 
-The paper's Figures 1 and 2 (appendix, Additional Zero123 MSE Landscape Visualization): why a start ends in the wrong
-valley. What fills the arrays is in `fields`.
+See the paper's Figures 1 and 2 (appendix, Additional Zero123 MSE Landscape Visualization); `fields` fills the arrays.
 """
 
 from __future__ import annotations
@@ -19,15 +18,14 @@ from lp_framework.errors import UserError
 FLAT = 0.9  # a valley floor of which no more than a tenth of the range is relief tells nothing of the longitude
 PROMINENCE = 0.05  # of the landscape's range; a shallower dent is no minimum
 
-
 Grid = tuple[Tensor, Tensor]  # relative latitudes `[A]` and longitudes `[O]`, radians
 
 
 class LandscapeMinimum(NamedTuple):
     """A valley's bottom: its place (radians, between the grid's points), and the energy at the nearest of those.
 
-    `height` is where that lies in the landscape's range, from 0 to 1. `prominence` is the climb from there to the
-    lowest pass into deeper ground, in units of the range; of the deepest minimum it is 1.
+    In the landscape's range from 0 to 1, `height` is where that lies, and `prominence` the climb from there to the
+    lowest pass into deeper ground; of the deepest minimum it is 1.
     """
 
     latitude: float
@@ -38,10 +36,9 @@ class LandscapeMinimum(NamedTuple):
 
 
 class Landscape(NamedTuple):
-    """Energies `[A, O]` of one pair at relative latitudes `[A]` and longitudes `[O]` (radians), and one `radius`.
+    """Energies `[A, O]` of a pair at relative latitudes `[A]`, longitudes `[O]` (radians) and `radius` (scene units).
 
-    Latitudes ascend; longitudes are evenly spaced over the whole turn, from 0 up. The radius is relative, in scene
-    units.
+    Latitudes ascend; longitudes are evenly spaced over the whole turn, from 0 up.
     """
 
     latitude: Tensor
@@ -92,10 +89,9 @@ def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
     """The valleys of energies `[A, O]` whose prominence is `least` or more, the deepest first.
 
     Of each the number of its lowest point in the flattened grid, and `height` and `prominence` as of the minimum.
-
-    On a cylinder: periodic in longitude, open in latitude, so the lowest ground on a border is a valley as well (its
-    bottom may lie beyond). A point has eight neighbours. Equal energies side by side are one minimum, saddles are none,
-    energies that are not finite are passed over, and without relief there is no valley.
+    The grid is periodic in longitude and open in latitude: the lowest ground on a border is a valley as well. A point
+    has eight neighbours. Equal energies side by side are one minimum, saddles are none, energies that are not finite
+    are passed over, and without relief there is no valley.
     """
     rows, columns = energy.shape
     heights = energy.double().flatten().tolist()

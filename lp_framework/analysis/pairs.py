@@ -51,11 +51,10 @@ class ShownPair:
     """A pair and what a solver did with it, for N starts; radians and object sizes, NaN where there is no number.
 
     `truth` `[3]`, `ends` `[N, 3]` and `starts` `[N, 3]` are relative poses, `trajectories` `[N, S + 1, 3]` have
-    longitudes unreduced; solvers that keep no trajectory, or make candidates of their own, have None, and so has the
-    truth of photographs. `energies` `[N]` are the solver's, `chosen` is its answer, None where that is no pose;
+    longitudes unreduced; None where the solver keeps no trajectory or makes its own candidates, and for the truth of
+    photographs. `energies` `[N]` are the solver's, `chosen` is its answer, None where that is no pose;
     `rotation_errors` (degrees) and `translation_errors` are `[N]`. A pair that was not solved has no ends.
-    `landscapes` are those that the solver walked on, by name, at the true relative radius; `maps` are drawn beside the
-    images.
+    `landscapes` are by name, at the true relative radius; `maps` are drawn beside the images.
     """
 
     object: str
@@ -151,10 +150,7 @@ def shown_pairs(data: PairData, views: NDArray[np.int64], device: torch.device) 
 def named_pairs(
     data: PairDataModule, objects: Sequence[str], places: Sequence[tuple[int, int]], device: torch.device
 ) -> tuple[Pairs, list[ShownPair]]:
-    """Pairs of test views (reference, query), numbered from 0 within their object; see `shown_pairs`.
-
-    `UserError` for an object that the data do not have, and for a view that it does not have.
-    """
+    """Pairs of test views (reference, query), numbered from 0 within their object; `UserError` for unknown ones."""
     table = data.table("test")
     chosen = []
     for name, pair in zip(objects, places, strict=True):
@@ -190,10 +186,7 @@ def solved_pairs(
 
 
 def with_solution(pair: ShownPair, solution: Solution, starts: Tensor, place: int) -> ShownPair:
-    """The pair with the solution's problem number `place`.
-
-    A solver whose answers are not as many as the starts has made candidates of its own: the pair shows no starts.
-    """
+    """The pair with the solution's problem number `place`, without starts where the solver made its own candidates."""
     ends = _array(solution.poses[place])
     errors = np.full(len(ends), np.nan)
     if pair.truth is not None:
@@ -216,10 +209,7 @@ def with_solution(pair: ShownPair, solution: Solution, starts: Tensor, place: in
 
 
 def recording(solver: Solver) -> Solver:
-    """The solver and those that it is made of, told to keep their trajectories where they have a setting of that name.
-
-    It is a copy, so the given one stays as it is.
-    """
+    """A copy of the solver and of those it is made of, told to keep trajectories where they have a setting for it."""
     solver = copy.copy(solver)
     for name, part in vars(solver).items():
         if isinstance(part, Solver):
@@ -254,8 +244,8 @@ def with_fields(
 ) -> list[ShownPair]:  # fmt: skip
     """The pairs with two maps each, in one scale: the model's field, and the exact one, the best there is to learn.
 
-    An energy model has exp(-E) below it. Over the first are the ways of the pairs as they were `solved`, over the
-    second those of `first_stage` with the exact field in the model's place, where there is one.
+    Over the first are the ways of the pairs as they were `solved`, over the second those of `first_stage`, where there
+    is one, with the exact field in the model's place.
     """
     exact = fields.ExactModel(model.kernel, truths(shown), model.has_energy)
     ideal: Sequence[ShownPair | None] = [None] * len(shown)
@@ -290,8 +280,7 @@ def explained_pair(
     """One pair, solved once, with those starts alone that came to a pose; what the prior generates at the ends,
     `[N, H, W, 3]`; and the model's field on the landscape's grid, where there is a model.
 
-    The maps are of the first stage without noise, over the model's field and over the exact one. Photographs, whose
-    truth is not known, have none.
+    The maps are of the first stage without noise; photographs, whose truth is not known, have none.
     """
     seed, field, views = draws.seed, None, []
     (pair,) = solved_pairs(pairs, with_prior_energy(pairs, [pair], prior, draws, grid), solver, starts, seed)
