@@ -73,20 +73,17 @@ def load_model(checkpoint: str | Path = "score") -> PoseModel:
 
 def load_prior(name: str, **arguments: Any) -> Prior:
     """A pose-conditioned diffusion prior by the name of a choice of `prior=`, frozen."""
-    prior: Prior = registry.build("prior", _settings("prior", name, arguments))
-    return prior
+    return registry.build("prior", _settings("prior", name, arguments))
 
 
 def load_solver(name: str, model: PoseModel | None = None, prior: Prior | None = None, **arguments: Any) -> Solver:
     """A solver by the name of a choice of `solver=`, with the model and the prior that it asks for and its settings."""
-    solver: Solver = registry.build("solver", _settings("solver", name, arguments), model=model, prior=prior)
-    return solver
+    return registry.build("solver", _settings("solver", name, arguments), model=model, prior=prior)
 
 
 def make_starts(name: str, **arguments: Any) -> Starts:
     """Starts by the name of a choice of `start=`; `.make(pairs, seed)` gives `[B, N, 3]` relative poses."""
-    starts: Starts = registry.build("start", _settings("start", name, arguments))
-    return starts
+    return registry.build("start", _settings("start", name, arguments))
 
 
 def _settings(group: str, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
@@ -105,8 +102,7 @@ def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel) 
         components["prior"] = prior if isinstance(prior, Prior) else load_prior(prior)
         if prior == "tiny":
             warnings.warn(f"{TINY_KNOWS}. For photographs take load_prior('zero123xl', path=...)", stacklevel=3)
-    solver: Solver = registry.build("solver", settings, **components)
-    return solver
+    return registry.build("solver", settings, **components)
 
 
 def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Image.Image:

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -153,16 +153,10 @@ def _orderly_console() -> Iterator[None]:
         notes.handlers.clear()  # Hydra's handlers, above it, take over
         notes.propagate = True
 
-    def show(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int,
-        file: TextIO | None = None, line: str | None = None,
-    ) -> None:  # fmt: skip
-        log.warning("%s", " ".join(str(message).split()))
-
     with warnings.catch_warnings():
         for beginning in OF_NO_USE:
             warnings.filterwarnings("ignore", beginning)
-        warnings.showwarning = show
+        warnings.showwarning = lambda message, *_, **__: log.warning("%s", " ".join(str(message).split()))
         yield
 
 

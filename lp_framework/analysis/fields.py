@@ -150,8 +150,7 @@ def generated_views(
         pose = poses[number * batch : (number + 1) * batch].to(source.latent)
         repeated = source[torch.zeros(len(pose), dtype=torch.int64, device=pose.device)]
         parts.append(prior.generate(repeated, pose, steps, guidance, generator, eta).float().cpu())
-    views: NDArray = ((torch.cat(parts) + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy()
-    return views
+    return ((torch.cat(parts) + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy()
 
 
 @torch.no_grad()

@@ -94,8 +94,7 @@ class ShownPair:
         """Of each end the longitude of its start, degrees in [0, 360); None where the solver made its own."""
         if self.starts is None:
             return [None] * len(self.ends)
-        longitudes: list[float] = (np.rad2deg(self.starts[:, 1]) % 360).tolist()
-        return longitudes
+        return (np.rad2deg(self.starts[:, 1]) % 360).tolist()
 
     def arrived(self) -> ShownPair:
         """The pair with those starts alone that came to a pose."""
@@ -299,5 +298,4 @@ def explained_pair(
 
 
 def _array(values: Tensor) -> NDArray:
-    array: NDArray = values.detach().cpu().numpy()
-    return array
+    return values.detach().cpu().numpy()

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from lp_framework.benchmarks.harness import Section, Work, peak_bytes, worth
 from lp_framework.priors.base import Prior, ViewCode
+from lp_framework.priors.zero123 import original
 from lp_framework.priors.zero123.networks import (
     DTYPES,
     PUBLISHED,
@@ -25,17 +26,6 @@ from lp_framework.priors.zero123.networks import (
     clip_config,
     unet_config,
     vae_config,
-)
-from lp_framework.priors.zero123.original import (
-    EMA,
-    PROJECTION,
-    UNET,
-    VAE,
-    VISUAL,
-    clip_modules,
-    renamed,
-    unet_modules,
-    vae_modules,
 )
 from lp_framework.priors.zero123.prior import IMAGE_SIZE, Zero123Prior
 from lp_framework.priors.zero123.weights import load_networks, write_folder
@@ -175,16 +165,16 @@ def measure_loading(
     section.note = f"Zero123's {architecture} size, random weights; files just written, so from memory rather than disk"
     with tempfile.TemporaryDirectory(dir=place) as folder:
         networks = Computing(architecture).networks(torch.device("cpu"))
-        original = Path(folder) / "original.ckpt"
-        torch.save({"state_dict": original_tensors(networks)}, original)
+        published = Path(folder) / "original.ckpt"
+        torch.save({"state_dict": original_tensors(networks)}, published)
         works = {}
         for dtype in sorted(dtypes, key=lambda dtype: -DTYPES[dtype].itemsize):  # each is converted from the one before
             converted = Path(folder) / dtype
             write_folder(networks.to(DTYPES[dtype]), converted)
             size = sum(file.stat().st_size for file in converted.rglob("*"))
-            section.add(f"{dtype}: GB on disk", size / 1e9, original.stat().st_size / 1e9)
+            section.add(f"{dtype}: GB on disk", size / 1e9, published.stat().st_size / 1e9)
             first, second = (
-                worth(1, partial(load_networks, str(file), None, "ema", dtype)) for file in (converted, original)
+                worth(1, partial(load_networks, str(file), None, "ema", dtype)) for file in (converted, published)
             )
             works[f"{dtype}: seconds to load"] = first, second
         del networks
@@ -196,9 +186,9 @@ def original_tensors(networks: Networks) -> dict[str, Tensor]:
 
     The other way round from `priors.zero123.original`, so that its reading can be measured without the published files.
     """
-    unet = _renamed(networks.unet, unet_modules(networks.unet.config))
-    vae = _renamed(networks.vae, vae_modules(networks.vae.config))
-    clip = _renamed(networks.image_encoder, clip_modules(networks.image_encoder.config.to_dict()))
+    unet = _renamed(networks.unet, original.unet_modules(networks.unet.config))
+    vae = _renamed(networks.vae, original.vae_modules(networks.vae.config))
+    clip = _renamed(networks.image_encoder, original.clip_modules(networks.image_encoder.config.to_dict()))
     for key in [key for key in vae if ".attn_1." in key and vae[key].ndim == 2]:  # matrices as 1 x 1 convolutions
         vae[key] = vae[key][:, :, None, None]
     for key in [key for key in clip if ".q_proj." in key]:  # queries, keys and values as one tensor
@@ -206,14 +196,14 @@ def original_tensors(networks: Networks) -> dict[str, Tensor]:
         clip[key.replace(".q_proj.", ".in_proj_")] = torch.cat(parts)
     clip["proj"] = clip.pop("visual_projection.weight").t()
     return {
-        **{f"{UNET}{key}": tensor for key, tensor in unet.items()},
-        **{f"{EMA}diffusion_model{key.replace('.', '')}": tensor.clone() for key, tensor in unet.items()},
-        **{f"{VAE}{key}": tensor for key, tensor in vae.items()},
-        **{f"{VISUAL}{key}": tensor for key, tensor in clip.items()},
-        **{f"{PROJECTION}{key}": tensor for key, tensor in networks.cc_projection.state_dict().items()},
+        **{f"{original.UNET}{key}": tensor for key, tensor in unet.items()},
+        **{f"{original.EMA}diffusion_model{key.replace('.', '')}": tensor.clone() for key, tensor in unet.items()},
+        **{f"{original.VAE}{key}": tensor for key, tensor in vae.items()},
+        **{f"{original.VISUAL}{key}": tensor for key, tensor in clip.items()},
+        **{f"{original.PROJECTION}{key}": tensor for key, tensor in networks.cc_projection.state_dict().items()},
     }
 
 
 def _renamed(network: torch.nn.Module, modules: dict[str, str]) -> dict[str, Tensor]:
-    back = {ours: original for original, ours in modules.items()}
-    return {renamed(name, back): tensor for name, tensor in network.state_dict().items()}
+    back = {ours: theirs for theirs, ours in modules.items()}
+    return {original.renamed(name, back): tensor for name, tensor in network.state_dict().items()}

@@ -219,8 +219,7 @@ def overview_table(title: str, record: dict[str, Any]) -> Table:
 
 def table_of(title: str, columns: Sequence[str], numbers: Sequence[str]) -> Table:
     """An empty table for the terminal; the columns of numbers are to the right."""
-    look: Any = {"title_justify": "left", "caption_justify": "left", "box": box.SIMPLE_HEAD, "pad_edge": False}
-    table = Table(title=title, **look)
+    table = Table(title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         table.add_column(column, justify="right" if column in numbers else "left", no_wrap=True)
     return table

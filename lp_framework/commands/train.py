@@ -80,9 +80,10 @@ def run(config: DictConfig) -> None:
     model.recipe = recipe
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
-    trainer = building.build_trainer(
-        building.plain(config.trainer), folder, callbacks(config, folder), loggers(config, folder)
-    )
+    loggers: list[Logger] = [CSVLogger(folder, name="", version="")]  # `METRICS` in the run's folder
+    if config.logger.tensorboard:
+        loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))
+    trainer = building.build_trainer(building.plain(config.trainer), folder, callbacks(config, folder), loggers)
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
         if checkpoint is not None:
@@ -139,14 +140,6 @@ def callbacks(config: DictConfig, folder: Path) -> list[Callback]:
         chosen.append(
             ModelCheckpoint(folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True)
         )
-    return chosen
-
-
-def loggers(config: DictConfig, folder: Path) -> list[Logger]:
-    """CSV always, as `METRICS` in the run's folder; TensorBoard by config."""
-    chosen: list[Logger] = [CSVLogger(folder, name="", version="")]
-    if config.logger.tensorboard:
-        chosen.append(TensorBoardLogger(folder, name="tensorboard", version=""))
     return chosen
 
 
