@@ -18,14 +18,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    InterpolationResolutionError,
-    MissingMandatoryValue,
-    OmegaConfBaseException,
-)
+from omegaconf import DictConfig, OmegaConf, errors
 from yaml import YAMLError
 
 from lp_framework import catalogue, registry
@@ -107,7 +100,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
                 module = importlib.import_module(f"lp_framework.commands.{command}")
                 with _orderly_console():
                     module.run(config)
-            except (UserError, MissingMandatoryValue, InterpolationResolutionError) as error:
+            except (UserError, errors.MissingMandatoryValue, errors.InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
                 if sweep:
                     log.error("job %s (%s): %s", job.job.num, ", ".join(job.overrides.task), mistake)
@@ -241,11 +234,11 @@ def explain(error: Exception) -> str:
             return f"{group}={choice}: there is no {group} '{choice}'{nearest(choice, options)} ({_known(options)})"
         case OverrideParseException():
             return f"cannot read '{error.override}': {one_line(error) if '=' in error.override else 'write KEY=VALUE'}"
-        case MissingMandatoryValue():
+        case errors.MissingMandatoryValue():
             return f"{error.full_key} needs a value: give {error.full_key}=VALUE"
-        case HydraException() if isinstance(cause, ConfigKeyError | ConfigAttributeError):
+        case HydraException() if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
             return _place(error) + _unknown_key(cause)
-        case HydraException() if isinstance(cause, OmegaConfBaseException):
+        case HydraException() if isinstance(cause, errors.OmegaConfBaseException):
             return _place(error) + (f"{cause.full_key}: " if cause.full_key else "") + one_line(cause)
         case HydraException() if str(error).startswith("Ambiguous value for argument"):
             override = str(error).split("'")[1]
@@ -263,7 +256,7 @@ def _place(error: Exception) -> str:
     return place + colon if place.startswith("In '") else ""
 
 
-def _unknown_key(error: OmegaConfBaseException) -> str:
+def _unknown_key(error: errors.OmegaConfBaseException) -> str:
     key = str(error.full_key)
     parent, _, name = key.rpartition(".")
     node = OmegaConf.to_container(error.parent_node) if isinstance(error.parent_node, DictConfig) else None

@@ -13,14 +13,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning import Trainer
-from lightning.pytorch.callbacks import (
-    Callback,
-    EarlyStopping,
-    EMAWeightAveraging,
-    LearningRateMonitor,
-    ModelCheckpoint,
-    RichProgressBar,
-)
+from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -83,7 +76,7 @@ def run(config: DictConfig) -> None:
     loggers: list[Logger] = [CSVLogger(folder, name="", version="")]  # `METRICS` in the run's folder
     if config.logger.tensorboard:
         loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))
-    trainer = building.build_trainer(building.plain(config.trainer), folder, callbacks(config, folder), loggers)
+    trainer = building.build_trainer(building.plain(config.trainer), folder, chosen_callbacks(config, folder), loggers)
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
         if checkpoint is not None:
@@ -126,19 +119,21 @@ def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
         return best, read_checkpoint(best)
 
 
-def callbacks(config: DictConfig, folder: Path) -> list[Callback]:
+def chosen_callbacks(config: DictConfig, folder: Path) -> list[callbacks.Callback]:
     """Lightning's own parts: checkpoints (best, last), early stopping, moving average, rates, progress."""
     validated = config.data.validation_views > 0
-    chosen: list[Callback] = [LearningRateMonitor("step"), RichProgressBar(leave=False)]
+    chosen: list[callbacks.Callback] = [callbacks.LearningRateMonitor("step"), callbacks.RichProgressBar(leave=False)]
     if config.ema is not None:
-        chosen.append(EMAWeightAveraging(decay=config.ema))
+        chosen.append(callbacks.EMAWeightAveraging(decay=config.ema))
     if validated and config.patience is not None:
-        chosen.append(EarlyStopping("val/loss", patience=config.patience))
+        chosen.append(callbacks.EarlyStopping("val/loss", patience=config.patience))
     # A callback each: with `save_last` the last epoch would be kept only where it is the best one, too.
     for file, monitor, mode in ((BEST, "val/loss" if validated else None, "min"), (LAST, "epoch", "max")):
         named: dict[str, Any] = {"filename": Path(file).stem, "monitor": monitor, "mode": mode}
         chosen.append(
-            ModelCheckpoint(folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True)
+            callbacks.ModelCheckpoint(
+                folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True
+            )
         )
     return chosen
 
