@@ -60,8 +60,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     """After `Trainer.test`: up to `MOST` pairs, the largest error first, solved again to see their trajectories.
 
     Starts and draws are the evaluation's, so the answers are its answers; the errors are those that it counted. Pairs
-    of sets of images are not solved again, for their answers came of all images of a set: they have neither
-    trajectories nor maps.
+    of sets of images, whose answers came of all images of a set, are not solved again and have no maps.
     """
     evaluation.eval()
     rows, table, seed = evaluation.metrics.rows(), evaluation.table, evaluation.seed
@@ -86,9 +85,8 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     if isinstance(model, PoseModel) and not sets:
         shown = with_fields(pairs, shown, model, shown, solver if isinstance(solver, Langevin) else None, starts, seed)
     elif not sets:
-        reliefs = [pair.landscapes.get(PRIOR_ENERGY) for pair in shown]
-        shown = [replace(pair, maps=[PoseMap("Starts and answer", relief, ways=pair)])
-                 for pair, relief in zip(shown, reliefs, strict=True)]  # fmt: skip
+        shown = [replace(pair, maps=[PoseMap("Starts and answer", pair.landscapes.get(PRIOR_ENERGY), ways=pair)])
+                 for pair in shown]  # fmt: skip
     return [
         replace(
             pair,
@@ -113,13 +111,11 @@ def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
 def pick_examples(
     errors: NDArray, objects: NDArray, names: Sequence[str], unique_answer: Sequence[bool | None]
 ) -> dict[int, str]:
-    """Rows of up to `MOST` pairs, and why they are shown; the largest error first.
-
-    `errors` are rotation errors `[P]`, `objects` indices `[P]`.
+    """Rows of up to `MOST` pairs of rotation `errors` `[P]` and `objects` `[P]` (indices), and why they are shown.
 
     The worst, the median and the best among objects with a unique answer (among all where none is labelled so), and
     the median among those without one; then the worst of each object that is not among these, objects with a unique
-    answer first: a failure there is the solver's. Ties go to the earlier row.
+    answer first: a failure there is the solver's. The largest error comes first, and ties go to the earlier row.
     """
     failed = np.nan_to_num(errors, nan=np.inf)
     order, worst_first = (np.argsort(each, kind="stable").tolist() for each in (failed, -failed))
@@ -178,10 +174,8 @@ def as_json(example: ShownPair) -> dict[str, Any]:
         "landscapes": [
             {
                 "name": name,
-                "latitude": _numbers(each.latitude.numpy()),
-                "longitude": _numbers(each.longitude.numpy()),
                 "radius": round(each.radius, 5),
-                "energy": _numbers(each.energy.double().numpy()),
+                **{part: _numbers(getattr(each, part).numpy()) for part in ("latitude", "longitude", "energy")},
             }
             for name, each in example.landscapes.items()
         ],
@@ -194,19 +188,16 @@ def _example(folder: Path, number: int, entry: Mapping[str, Any]) -> ShownPair:
             pixels = np.asarray(image.convert("RGB"))
         return View(Path(entry[name]["file"]), pixels, _array(entry[name]["pose"]))
 
-    arrays: dict[str, Any] = {name: _array(entry[name]) for name in ARRAYS if entry[name] is not None}
-    if not 0 <= (chosen := int(entry["chosen"])) < len(arrays["ends"]):
-        raise ValueError(f"chosen is {chosen} of {len(arrays['ends'])}")
+    values: dict[str, Any] = {name: _array(entry[name]) for name in ARRAYS if entry[name] is not None}
+    if not 0 <= (chosen := int(entry["chosen"])) < len(values["ends"]):
+        raise ValueError(f"chosen is {chosen} of {len(values['ends'])}")
     landscapes = {}
     for each in entry["landscapes"]:
-        latitude, longitude, energy = (
-            torch.from_numpy(_array(each[key])) for key in ("latitude", "longitude", "energy")
-        )
-        landscapes[str(each["name"])] = Landscape(latitude, longitude, float(each["radius"]), energy)
-    name, ambiguity, reason = (str(entry[key]) for key in ("object", "ambiguity", "reason"))
-    return ShownPair(
-        name, ambiguity, reason, view("reference"), view("query"), chosen=chosen, landscapes=landscapes, **arrays
-    )
+        grid = {part: torch.from_numpy(_array(each[part])) for part in ("latitude", "longitude", "energy")}
+        landscapes[str(each["name"])] = Landscape(radius=float(each["radius"]), **grid)
+    values |= {name: str(entry[name]) for name in ("object", "ambiguity", "reason")}
+    values |= {name: view(name) for name in ("reference", "query")}
+    return ShownPair(chosen=chosen, landscapes=landscapes, **values)
 
 
 def _numbers(values: NDArray | None) -> Any:

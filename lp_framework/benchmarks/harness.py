@@ -91,10 +91,7 @@ def timed(work: Callable[[], _Result], device: torch.device) -> tuple[float, _Re
 
 
 def counted(work: Callable[[], object]) -> int:
-    """Floating-point operations of the matrix products, convolutions and attentions in a piece of work.
-
-    Their number depends on shapes alone: tensors on the meta device do, on which nothing is computed.
-    """
+    """Floating-point operations of the matrix products, convolutions and attentions in work on any device, meta too."""
     with FlopCounterMode(display=False) as counter:
         work()
     return int(counter.get_total_flops())
@@ -109,10 +106,7 @@ def peak_rate(device: torch.device, dtype: torch.dtype) -> float:
 
 
 def launched(work: Callable[[], object]) -> int:
-    """Operators in a piece of work that compute something, each at least one launch of a kernel on a GPU.
-
-    Views and memory that is only taken do not count.
-    """
+    """Operators in a piece of work that compute something, each at least one launch of a kernel on a GPU."""
     with _Operators() as operators:
         work()
     return operators.launches
@@ -121,8 +115,8 @@ def launched(work: Callable[[], object]) -> int:
 def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
     """Bytes that the tensors made by some work take at most at once, beyond those that were there before.
 
-    On a GPU PyTorch's allocator counts; on a CPU, where nobody does, every operation's results are followed until they
-    are gone (which takes time: do not clock it). What a kernel needs for itself is in the first alone.
+    On a GPU PyTorch's allocator counts; on a CPU every operation's results are followed until they are gone, which
+    takes time and leaves out what a kernel needs for itself.
     """
     if device.type == "cuda":
         torch.cuda.synchronize(device)

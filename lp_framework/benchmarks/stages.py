@@ -27,10 +27,7 @@ SCALING = "scaling: two_stage", ("most", "fewest")
 
 @torch.no_grad()
 def plain_loop(solver: Langevin, pairs: Pairs, starts: Tensor) -> Tensor:
-    """`langevin` as a loop: a pair at a time, its two images encoded, then one start after the other.
-
-    Final poses `[B, N, 3]` from starts `[B, N, 3]`, longitudes unreduced.
-    """
+    """`langevin` as a loop over pairs and starts `[B, N, 3]`; its final poses `[B, N, 3]`, longitudes unreduced."""
     model, ends = solver.model, torch.empty_like(starts)
     gamma = starts.new_tensor(solver.gamma)
     for pair in range(len(pairs)):

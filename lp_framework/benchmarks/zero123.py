@@ -112,10 +112,9 @@ class PlainLoop:
     """One start `[3]` of a sequential loop, its costs those of iFusion's published code (`optimize_pose_loop`).
 
     As there: both images are encoded anew at every step, by the autoencoder once as targets and once as conditions,
-    by CLIP as conditions; float32; both directions in one batch of two; attention that spells out its weights, also
-    over the single token of the condition; weights without gradients; a twist that lives on the CPU; a loss that is
-    read at every step, for the plateau scheduler. Left out, and next to free: condition dropout, sampling of the
-    posterior, the progress bar.
+    by CLIP as conditions; float32; both directions in one batch of two; attention that spells out its weights; a twist
+    that lives on the CPU; a loss that is read at every step, for the plateau scheduler. Left out, and next to free:
+    condition dropout, sampling of the posterior, the progress bar.
     """
 
     def __init__(self, prior: Zero123Prior, images: Tensor, start: Tensor) -> None:
@@ -158,9 +157,8 @@ def measure_loading(
 ) -> None:
     """Loading onto the CPU in each of `dtypes`, in which the folder is kept, too; the original is float32.
 
-    The files, of random weights, lie in a temporary folder in `place`; just written, they come from the system's memory
-    rather than from the disk. The original holds the U-Net twice, raw and averaged, as published ones; it lacks their
-    optimizer state, which is not read.
+    The files, of random weights, lie in a temporary folder in `place`. The original holds the U-Net twice, raw and
+    averaged, as published ones; it lacks their optimizer state, which is not read.
     """
     section.note = f"Zero123's {architecture} size, random weights; files just written, so from memory rather than disk"
     with tempfile.TemporaryDirectory(dir=place) as folder:
@@ -182,10 +180,7 @@ def measure_loading(
 
 
 def original_tensors(networks: Networks) -> dict[str, Tensor]:
-    """The tensors by the names and in the shapes of the training code, the U-Net's also as its moving averages.
-
-    The other way round from `priors.zero123.original`, so that its reading can be measured without the published files.
-    """
+    """The tensors as the training code names and shapes them, the U-Net's also as moving averages; see `original`."""
     unet = _renamed(networks.unet, original.unet_modules(networks.unet.config))
     vae = _renamed(networks.vae, original.vae_modules(networks.vae.config))
     clip = _renamed(networks.image_encoder, original.clip_modules(networks.image_encoder.config.to_dict()))

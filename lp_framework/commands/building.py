@@ -88,10 +88,7 @@ class Components:
 
 
 def warn_of_unused(components: Components) -> None:
-    """Say that a prior or a checkpoint named on the command line has no effect, because the solver takes none.
-
-    Not in a sweep, which may go over solvers that do.
-    """
+    """Say that a prior or a checkpoint named on the command line has no effect on this solver; not in a sweep."""
     job, name = HydraConfig.get(), components.settings["solver"]["name"]
     named = {override.partition("=")[0].strip("+~").partition(".")[0] for override in job.overrides.task}
     for key, component in (("prior", "prior"), ("checkpoint", "model")):
@@ -165,10 +162,7 @@ def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[s
 
 
 def weights_fingerprint(networks: Sequence[nn.Module], sample: int = 1024) -> str:
-    """A text that changes when networks do: of every parameter and buffer its name, shape and first values.
-
-    Training changes every tensor, so a `sample` of each tells; of large networks all of it would take long to read.
-    """
+    """A text that changes when networks do: of every parameter and buffer its name, shape and `sample` first values."""
     digest = hashlib.blake2b(digest_size=16)
     for network in networks:
         for name, value in network.state_dict().items():

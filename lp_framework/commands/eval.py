@@ -40,10 +40,7 @@ LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 star
 
 
 def run(config: DictConfig) -> None:
-    """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder.
-
-    With `resume` it is the folder of an evaluation that was stopped.
-    """
+    """Evaluate and write `results.json`, `results.csv`, `pairs.csv` and pictures into this run's folder."""
     folder, checkpoint = building.run_folder(), None
     if config.resume is not None:
         folder = Path(config.resume)
@@ -103,11 +100,9 @@ def run(config: DictConfig) -> None:
 
 
 def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | None) -> bool:
-    """Whether `folder` has the results of this very job of a sweep, with `settings` and the model of `checkpoint`;
-    if so, that is printed.
+    """Whether `folder` has the results of this very job of a sweep, not older than its checkpoint; then says so.
 
-    The results have to be of the same configuration, seeds included, and not older than the checkpoint. Raises
-    `UserError` for other results: they are not overwritten. A job without a readable `results.json` is to be run.
+    Raises `UserError` for other results, which are not overwritten; a job whose results cannot be read runs.
     """
     if HydraConfig.get().mode != RunMode.MULTIRUN:
         return False
@@ -131,10 +126,7 @@ def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | No
 
 
 def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig, Path | None]:
-    """The config and the checkpoint of the stopped `eval` in `folder`; it may be resumed on other devices.
-
-    Raises `UserError` where there is none, and for a command line with other settings.
-    """
+    """The config and the checkpoint of the stopped `eval` in `folder`; `UserError` where there is none."""
     if (folder / RESULT).is_file():
         raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
     subject = journal.unfinished(folder)
@@ -148,10 +140,7 @@ def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig,
 
 
 def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
-    """Pairs in a batch: the setting `batch_pairs`, or by default what suits the size of the solver's networks.
-
-    A batch is saved when it is solved.
-    """
+    """Pairs in a batch: the setting `batch_pairs`, or by default what suits the size of the solver's networks."""
     if batch_pairs is None:
         parameters = sum(each.numel() for network in solver.networks() for each in network.parameters())
         if parameters <= LARGE:
@@ -182,8 +171,7 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
 def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: Mapping[str, Any]) -> list[Path]:
     """After `Trainer.test`: maps of some pairs (failures first), cumulative errors, and the objects, into `folder`.
 
-    Each as PNG and PDF; returns the PNG files. Sets of images have no maps. `EXAMPLES` below the folder gets the
-    pairs, for the page of the run.
+    Returns the PNG files. `EXAMPLES` below the folder gets the pairs, for the page of the run.
     """
     examples = gather_examples(evaluation, data)
     save_examples(folder / EXAMPLES, examples)
