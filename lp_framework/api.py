@@ -93,8 +93,7 @@ def _settings(group: str, name: str, arguments: dict[str, Any]) -> dict[str, Any
 
 
 def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel) -> Solver:
-    settings = _settings("solver", name, {})
-    wanted = registry.component_names(registry.get("solver", settings["name"]))
+    wanted = registry.component_names(registry.get("solver", _settings("solver", name, {})["name"]))
     components: dict[str, Any] = {}
     if "model" in wanted:
         components["model"] = model if isinstance(model, PoseModel) else load_model(model)
@@ -102,7 +101,7 @@ def _build_solver(name: str, prior: str | Prior, model: str | Path | PoseModel) 
         components["prior"] = prior if isinstance(prior, Prior) else load_prior(prior)
         if prior == "tiny":
             warnings.warn(f"{TINY_KNOWS}. For photographs take load_prior('zero123xl', path=...)", stacklevel=3)
-    return registry.build("solver", settings, **components)
+    return load_solver(name, **components)
 
 
 def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Image.Image:

@@ -88,15 +88,10 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
         shown = [replace(pair, maps=[PoseMap("Starts and answer", pair.landscapes.get(PRIOR_ENERGY), ways=pair)])
                  for pair in shown]  # fmt: skip
     return [
-        replace(
-            pair,
-            reason=reason,
-            chosen=int(chosen[row]),
-            rotation_errors=rotation[row],
-            translation_errors=translation[row],
-        )
+        replace(pair, reason=reason, chosen=int(chosen[row]), rotation_errors=rotation[row],
+                translation_errors=translation[row])
         for (row, reason), pair in zip(picks.items(), shown, strict=True)
-    ]
+    ]  # fmt: skip
 
 
 def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:

@@ -1,7 +1,4 @@
-"""The harness of `bench`: two contenders at the same work, alternated round by round within one run.
-
-Besides time it knows what a piece of work takes of operations, launches of kernels, and memory.
-"""
+"""The harness of `bench`: two contenders at work in turn, and what it takes of operations, launches and memory."""
 
 from __future__ import annotations
 

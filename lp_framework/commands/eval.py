@@ -1,7 +1,4 @@
-"""`eval`: a solver on a data set's test views, as a table in the paper's layout, JSON and CSV.
-
-A run that was stopped is resumed by `resume=RUN_FOLDER`, or by the same command in the same folder.
-"""
+"""`eval`: a solver on a data set's test views; one that was stopped goes on with `resume=RUN_FOLDER`."""
 
 from __future__ import annotations
 
