@@ -15,7 +15,6 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examples
-from lp_framework.analysis.pairs import ShownPair
 from lp_framework.commands import building
 from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairData
@@ -174,33 +173,21 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: 
     save_examples(folder / EXAMPLES, examples)
     rows, table = evaluation.metrics.rows(), evaluation.table
     rotation, translation, chosen = (rows[name].numpy() for name in ("rotation", "translation", "chosen"))
-    figures = {
-        f"field_{number}": pair_figure(pair, pair.maps, f"{pair.title} ({pair.ambiguity})", answer_note(pair))
-        for number, pair in enumerate(examples)
-        if pair.maps
-    }
+    figures = {}
+    for number, pair in enumerate(examples):
+        if pair.maps:
+            degrees, distance = pair.rotation_errors[pair.chosen], pair.translation_errors[pair.chosen]
+            off = f"rotation error {degrees:.1f}°, translation error {distance:.2f}"
+            note = f"{pair.reason}: {'no answer' if np.isnan(degrees) else off}"
+            figures[f"field_{number}"] = pair_figure(pair, pair.maps, f"{pair.title} ({pair.ambiguity})", note)
     classes = [table.ambiguities[index] for index in rows["object"].tolist()]
     figures["errors"] = errors_figure(rotation, translation, chosen, classes)
-    figures["objects"] = objects_figure(object_cards(result["per_object"], data))
+    assert data.images is not None  # evaluation never caches features
+    cards = []
+    for index, name in enumerate(data.table.names):
+        if (metrics := result["per_object"][name]) is not None:  # without a success rate where a pair has one answer
+            view = np.asarray(data.images[data.table.views_of(index)[0]])
+            rates = metrics["R(R)@15"], metrics.get("SR(R)@30")
+            cards.append(ObjectCard(name, data.table.ambiguities[index], view, *rates))
+    figures["objects"] = objects_figure(cards)
     return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]
-
-
-def answer_note(pair: ShownPair) -> str:
-    """Why a pair is shown, and how far off its answer is."""
-    degrees, distance = pair.rotation_errors[pair.chosen], pair.translation_errors[pair.chosen]
-    off = f"rotation error {degrees:.1f}°, translation error {distance:.2f}"
-    return f"{pair.reason}: {'no answer' if np.isnan(degrees) else off}"
-
-
-def object_cards(per_object: Mapping[str, Mapping[str, float] | None], data: PairData) -> list[ObjectCard]:
-    """A card for every object that has pairs, with its first view; no success rate where a pair has one answer."""
-    table, images = data.table, data.images
-    assert images is not None  # evaluation never caches features
-    return [
-        ObjectCard(
-            name, table.ambiguities[index], np.asarray(images[table.views_of(index)[0]]), metrics["R(R)@15"],
-            metrics.get("SR(R)@30"),
-        )
-        for index, name in enumerate(table.names)
-        if (metrics := per_object[name]) is not None
-    ]  # fmt: skip

@@ -53,7 +53,7 @@ def run(config: DictConfig) -> None:
     save_png(folder / "source.png", image)
     records: list[dict[str, Any]] = [
         {
-            "file": f"{FOLDER}/{file_name(latitude, longitude)}",
+            "file": f"{FOLDER}/latitude{latitude:+g}_longitude{longitude:03g}.png",
             "relative_latitude_degrees": latitude,
             "relative_longitude_degrees": round(longitude, 6),
             "relative_pose": [round(value, 6) for value in pose],
@@ -89,12 +89,3 @@ def grid(latitudes: Sequence[float], longitudes: Sequence[float]) -> Tensor:
     degrees = torch.cartesian_prod(*(torch.tensor(each, dtype=torch.float64) for each in (latitudes, longitudes)))
     poses = torch.cat([torch.deg2rad(degrees), torch.zeros(len(degrees), 1)], dim=1)
     return poses.float().view(len(latitudes), len(longitudes), 3)
-
-
-def file_name(latitude: float, longitude: float) -> str:
-    """The name of a view's file, of its relative angles in degrees.
-
-    >>> file_name(-20.0, 30.0)
-    'latitude-20_longitude030.png'
-    """
-    return f"latitude{latitude:+g}_longitude{longitude:03g}.png"
