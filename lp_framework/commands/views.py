@@ -11,9 +11,8 @@ import torch
 from omegaconf import DictConfig
 from PIL import Image
 from rich.console import Console
-from torch import Tensor
 
-from lp_framework.analysis.fields import generated_views
+from lp_framework.analysis.fields import generated_views, grid_poses
 from lp_framework.analysis.pairs import object_index, words
 from lp_framework.api import image_batch
 from lp_framework.commands.building import begin
@@ -42,7 +41,8 @@ def run(config: DictConfig) -> None:
         file = data.table("test").objects[object_index(data, str(config.object))].files[0]
         image = prepare(read_image(file), str(file), crop=False)
     prior: Prior = components["prior"].to(device)
-    poses = grid(latitudes, longitudes)  # [rows, columns, 3]
+    degrees = (torch.tensor(each, dtype=torch.float64) for each in (latitudes, longitudes))
+    (poses,) = grid_poses(torch.zeros(1), *map(torch.deg2rad, degrees))  # [rows, columns, 3]
     code, columns = prior.encode(image_batch([image]).to(device)), poses.transpose(0, 1).flatten(0, 1)
     with shown_progress():  # a column at once
         drawn = generated_views(prior, code, columns, seed=config.seed, batch=len(latitudes), **sampling)
@@ -82,10 +82,3 @@ def angles(latitudes: Sequence[float], count: int) -> tuple[list[float], list[fl
     if not chosen or not in_range or len({*chosen}) < len(chosen):
         raise UserError(f"latitudes_degrees must list different angles between -180 and 180, got {latitudes}")
     return [float(each) for each in chosen], [360 * number / count for number in range(count)]
-
-
-def grid(latitudes: Sequence[float], longitudes: Sequence[float]) -> Tensor:
-    """Relative poses `[rows, columns, 3]` (radians, radius 0) of angles in degrees."""
-    degrees = torch.cartesian_prod(*(torch.tensor(each, dtype=torch.float64) for each in (latitudes, longitudes)))
-    poses = torch.cat([torch.deg2rad(degrees), torch.zeros(len(degrees), 1)], dim=1)
-    return poses.float().view(len(latitudes), len(longitudes), 3)
