@@ -64,10 +64,7 @@ def estimate_pose(
 
 
 def load_model(checkpoint: str | Path = "score") -> PoseModel:
-    """A trained model: weights that ship under a name, a checkpoint file, a training run's folder or a hub id.
-
-    Raises `UserError` where there is none.
-    """
+    """A trained model: weights that ship under a name, a checkpoint file, a training run's folder or a hub id."""
     return read_model(checkpoint)
 
 

@@ -154,10 +154,7 @@ def _orderly_console() -> Iterator[None]:
 
 
 def _store_plugin_configs(config_dir: str | None) -> None:
-    """Give Hydra the choices of plugins, but for names of the user's own or the built-in configs, which come first.
-
-    A file with a mistake is named, and the others are there.
-    """
+    """Give Hydra the choices of plugins, but for names of the user's own or the built-in configs, which come first."""
     folders = registry.conf_folders()
     choices = dict.fromkeys(registry.plugin_classes())
     for folder in folders:

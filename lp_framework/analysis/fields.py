@@ -140,10 +140,7 @@ def generated_views(
     prior: Prior, source: ViewCode, poses: Tensor, steps: int, guidance: float, seed: int,
     eta: float = 1.0, batch: int = 16,
 ) -> NDArray:  # fmt: skip
-    """Views `[N, H, W, 3]` in [0, 1] of one image's code under relative poses `[N, 3]`, by DDIM, `batch` at once.
-
-    All have the same draws, so that they differ by their poses alone.
-    """
+    """Views `[N, H, W, 3]` in [0, 1] of one image's code under relative poses `[N, 3]`, by DDIM with the same draws."""
     parts = []
     for number in steps_of(math.ceil(len(poses) / batch), "generated views"):
         generator = torch.Generator().manual_seed(seed)  # on the CPU: a GPU gets the same draws
@@ -162,10 +159,7 @@ def model_field(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, gri
 
 
 def model_landscapes(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid) -> list[Landscape]:
-    """A model's energy over a grid for B pairs, at relative radii `[B]`; of a score model the length of the score.
-
-    That is small where the model takes the pose for right.
-    """
+    """A model's energy over a grid for B pairs, at relative radii `[B]`; of a score model the length of the score."""
     score, energy = model_field(model, pairs, radius, grid)
     values = (score.norm(dim=-1) if energy is None else energy).cpu()
     return [Landscape(*grid, *each) for each in zip(radius.tolist(), values, strict=True)]

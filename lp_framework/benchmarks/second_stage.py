@@ -262,9 +262,9 @@ def measure_descent(
 
 
 def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
-    """Of a solution with its trajectory, at the start and after each step: energies on the probe, the mean over pairs
-    and starts, and the network passes a start so far. Before its first step it has passed the network `looks` times as
-    often as in each.
+    """At the start and after each step of a solution: mean energies on the probe, and network passes a start so far.
+
+    Before its first step it has passed the network `looks` times as often as in each.
     """
     path = solution.trajectory
     assert path is not None  # it was asked for

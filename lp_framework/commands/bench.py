@@ -18,7 +18,7 @@ from rich.table import Table
 from lp_framework import registry
 from lp_framework.benchmarks import batches, rendering, second_stage, stages, zero123
 from lp_framework.benchmarks.harness import Section
-from lp_framework.commands.building import Components, begin, versions
+from lp_framework.commands.building import Components, begin, plain, versions
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.tables import write_json
 from lp_framework.models.checkpoints import SHIPPED, load_model
@@ -42,8 +42,8 @@ MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]]
 
 def run(config: DictConfig) -> None:
     """Run the measurements named in `measure`; what has been measured so far is always in `bench.json`."""
-    folder, device, components = begin(config)
-    settings = components.settings
+    folder, device, _ = begin(config)
+    settings = plain(config)
     names = [settings["measure"]] if isinstance(settings["measure"], str) else settings["measure"]
     for name in names:
         if name not in MEASUREMENTS:
@@ -63,14 +63,14 @@ def run(config: DictConfig) -> None:
     try:
         for name in names:
             function, (title, contenders) = MEASUREMENTS[name]
-            wanted = arguments(name, function, components, device, folder)
+            wanted = arguments(name, function, settings, device, folder)
             section = Section(title, contenders, device, save)
             sections[name] = section
             with Console(stderr=True).status(f"measuring {name}"):
                 function(section, **wanted)
             save()
             del wanted
-            gc.collect()  # the networks of a measurement, lest the next one finds the GPU full
+            gc.collect()
             if device.type == "cuda":
                 torch.cuda.empty_cache()
     finally:
@@ -79,10 +79,10 @@ def run(config: DictConfig) -> None:
 
 
 def arguments(
-    name: str, function: Callable[..., None], components: Components, device: torch.device, folder: Path
+    name: str, function: Callable[..., None], settings: Mapping[str, Any], device: torch.device, folder: Path
 ) -> dict[str, Any]:
     """What a measurement takes besides its section: the settings of its name, and objects by theirs."""
-    settings = components.settings
+    components = Components(settings)  # anew, so that no measurement finds the GPU full of another's networks
     makers: dict[str, Callable[[], object]] = {
         "computing": lambda: zero123.Computing(**_settings(settings, "second_stage", zero123.Computing)),
         # The one that ships: figures are to be compared, whatever has been trained here.
