@@ -33,10 +33,7 @@ Verdict = Literal["unique", "twofold", "several", "continuous"]
 
 
 def azimuth_energies(prior: Prior, pairs: Pairs, poses: Tensor, azimuths: Tensor, draws: Draws) -> Tensor:
-    """Energies `[B, A]` at the relative longitudes `azimuths` `[A]` (radians), for B pairs of true `poses` `[B, 3]`.
-
-    As `prior_landscapes`, but latitude and radius are the true ones.
-    """
+    """Energies `[B, A]` of B pairs at relative longitudes `[A]` (radians); latitude and radius are those of `poses`."""
     around = poses[:, None].repeat(1, len(azimuths), 1)
     around[..., 1] = azimuths.to(poses)
     return pose_energies(prior, pairs, around, draws)

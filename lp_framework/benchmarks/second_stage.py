@@ -56,10 +56,7 @@ class Arithmetic(NamedTuple):
 
 
 def measure_step(section: Section, computing: Computing, starts: Sequence[int], rounds: int, steps: int) -> None:
-    """`rounds` of `steps` optimisation steps with each number of `starts`, on random weights.
-
-    `computing` is how the batch is computed; the loop is as published in any case.
-    """
+    """Optimisation steps on random weights; `computing` is how the batch is computed, the loop is as published."""
     device = section.device
     networks, pair = computing.networks(device), random_pair(device)
     batch_prior, loop_prior = computing.prior(networks), plain_prior(networks)
@@ -179,10 +176,7 @@ def measure_precision(
     section: Section, architecture: Architecture, variants: Sequence[str], starts: int, rounds: int, steps: int,
     max_batch: int | None,
 ) -> None:  # fmt: skip
-    """`rounds` of `steps` steps of a pair from `starts` starts, on the same random weights.
-
-    One variant after the other, so that no more than two U-Nets are held.
-    """
+    """Steps of a pair on the same random weights, a variant after the other, so that two U-Nets are held at most."""
     device, plain = section.device, Computing(architecture, max_batch=max_batch)
     computings = {words: variant(words, architecture, max_batch) for words in variants}
     networks, pair = plain.networks(device), random_pair(device)

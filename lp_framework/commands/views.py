@@ -48,7 +48,6 @@ def run(config: DictConfig) -> None:
         drawn = generated_views(prior, code, columns, seed=config.seed, batch=len(latitudes), **sampling)
     views = np.rint(255 * drawn).astype(np.uint8).reshape(len(longitudes), len(latitudes), *drawn.shape[1:])
     views = views.swapaxes(0, 1)  # [rows, columns, h, w, 3]
-
     (folder / FOLDER).mkdir(exist_ok=True)
     save_png(folder / "source.png", image)
     records: list[dict[str, Any]] = [
