@@ -176,8 +176,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Once called, commands choose the device, as they would choose a GPU."""
 
     def choose() -> None:
-        for command in ("bench", "estimate", "figure", "landscape", "views"):
-            monkeypatch.setattr(f"lp_framework.commands.{command}.choose_device", lambda accelerator: FAR)
+        monkeypatch.setattr("lp_framework.commands.building.best_device", lambda: FAR)
         strategy = SingleDeviceStrategy(device=FAR, accelerator=FarAccelerator())
         trainer = functools.partial(Trainer, strategy=strategy)
 
