@@ -145,7 +145,6 @@ def _orderly_console() -> Iterator[None]:
         notes = logging.getLogger(name)
         notes.handlers.clear()  # Hydra's handlers, above it, take over
         notes.propagate = True
-
     with warnings.catch_warnings():
         for beginning in OF_NO_USE:
             warnings.filterwarnings("ignore", beginning)

@@ -113,7 +113,8 @@ def begin(config: DictConfig) -> tuple[Path, torch.device, Components]:
     if config.accelerator not in ("auto", "cpu", best.type):
         choices = " or ".join(dict.fromkeys(["auto", "cpu", best.type]))
         raise UserError(f"accelerator={config.accelerator} is not available on this machine; choose {choices}")
-    return folder, torch.device("cpu") if config.accelerator == "cpu" else best, Components(plain(config))
+    device = torch.device("cpu") if config.accelerator == "cpu" else best
+    return folder, device, Components(plain(config))
 
 
 def seed_run(seed: object) -> None:
