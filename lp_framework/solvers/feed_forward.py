@@ -89,13 +89,16 @@ class FeedForward(RelativeCameraSolver):
     def cameras(self, images: Tensor) -> Tensor:
         """Cameras to world `[2, 4, 4]` with OpenCV's axes of prepared images `[2, 3, H, W]` in [-1, 1]; NaN: none."""
 
+    def prepare(self, images: Tensor) -> Tensor:
+        """Images `[I, 3, H, W]` at the network's size: resampled as Pillow does, in [-1, 1]."""
+        size = (self.image_size, self.image_size)
+        return interpolate(images, size, mode="bicubic", align_corners=False, antialias=True).clamp(-1, 1)
+
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
         """See `RelativeCameraSolver.predict`; these have no energies, all are 0."""
-        size, found = (self.image_size, self.image_size), []
-        for pair in torch.stack([pairs.reference, pairs.query], dim=1):
-            images = interpolate(pairs.images[pair], size, mode="bicubic", align_corners=False, antialias=True)
-            found.append(self.cameras(images.clamp(-1, 1)).cpu().double())
-        reference, query = from_opencv(torch.stack(found)).unbind(dim=1)
+        ends = torch.stack([pairs.reference, pairs.query], dim=1)
+        both = torch.stack([self.cameras(self.prepare(pairs.images[pair])).cpu().double() for pair in ends])
+        reference, query = from_opencv(both).unbind(dim=1)
         energies = torch.zeros(len(pairs), dtype=torch.float64)
         return relative_camera(reference, query), energies, self.passes_per_pair * len(pairs)
 
