@@ -388,7 +388,7 @@ def test_the_other_layout_in_circulation(networks, folder, tmp_path):
 
 def test_bad_folders(folder, tmp_path):
     (tmp_path / "empty").mkdir()
-    assert "no unet/config.json" in refused(tmp_path / "empty")
+    assert "holds no pose projection" in refused(tmp_path / "empty")
     assert "one set of weights" in refused(folder, "raw")
 
     def changed(name: str) -> Path:
