@@ -19,7 +19,7 @@ from lp_framework.data.pairs import PairBatch, PairData, ViewTable
 from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world
-from lp_framework.models.backbones import Backbone, EfficientNetLite0, ResNet, Standardise, freeze
+from lp_framework.models.backbones import Backbone, EfficientNetLite0, ResNet, Standardise
 from lp_framework.models.networks import PoseEmbedding, PoseNetwork
 from lp_framework.models.pose_model import EnergyModel, ScoreModel
 
@@ -33,7 +33,7 @@ class Colors(Backbone):
         super().__init__()
         self.image_size, self.trunk_dim, self.feature_dim, self.frozen = 8, 12, features, True
         self.net = nn.Sequential(nn.Conv2d(3, 12, 3), nn.BatchNorm2d(12), nn.AdaptiveAvgPool2d(1), nn.Flatten())
-        freeze(self.net)
+        self.net.eval().requires_grad_(False)
         self.head = nn.Linear(12, features)
 
     def trunk_module(self) -> nn.Module:

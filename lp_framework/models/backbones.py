@@ -1,8 +1,4 @@
-"""Backbones: an image in, a feature vector out.
-
-A backbone has two parts. The trunk comes pretrained; when it is frozen its features are computed once and cached. The
-head is trained always.
-"""
+"""Backbones: an image in, a feature vector out, by a pretrained trunk, which may be frozen, and a trained head."""
 
 from __future__ import annotations
 
@@ -72,8 +68,7 @@ class Backbone(nn.Module):
 class Standardise(nn.Module):
     """Each feature to mean 0 and standard deviation 1 over all training data met so far.
 
-    Unlike batch normalisation it never uses the batch's own statistics: a batch here holds many views of few objects,
-    and what they share is what tells the objects apart.
+    Unlike batch normalisation it never uses the batch's own statistics: a batch here has many views of few objects.
     """
 
     count: Tensor
@@ -109,18 +104,12 @@ class Standardise(nn.Module):
         self.count.copy_(count)
 
 
-def freeze(module: nn.Module) -> None:
-    """Fix a module's weights."""
-    module.eval().requires_grad_(False)
-
-
 @register("backbone", "efficientnet_lite0")
 class EfficientNetLite0(Backbone):
     """EfficientNet-Lite0 with ImageNet weights that come as a Python package: works offline, frozen, cached.
 
-    The features are those of the last stage at a sixteenth of the resolution, averaged over a 4 x 4 grid: later stages
-    say what an object is, this one still says how it stands. A head of two layers is trained on them, with `dropout` of
-    the cached features; its few outputs (`features`) are what training finds the longitude in.
+    The features are those of the last stage at a sixteenth of the resolution, averaged over a 4 x 4 grid, which still
+    say how an object stands. A head of two layers is trained on them, with `dropout` of the cached features.
     """
 
     def __init__(self, hidden: int = 512, features: int = 32, dropout: float = 0.2) -> None:
@@ -134,7 +123,7 @@ class EfficientNetLite0(Backbone):
         network.load_state_dict(weights)
         stride_32 = next(i for i, block in enumerate(network._blocks) if block._project_conv.out_channels == 192)
         self.stem = nn.Sequential(network._conv_stem, network._bn0, nn.ReLU6(), *network._blocks[:stride_32])
-        freeze(self.stem)
+        self.stem.eval().requires_grad_(False)
         channels = network._blocks[stride_32 - 1]._project_conv.out_channels
         self.trunk_dim = channels * 16
         self.head = nn.Sequential(
@@ -184,7 +173,7 @@ class ResNet(Backbone):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         if frozen:
-            freeze(self.resnet)
+            self.resnet.eval().requires_grad_(False)
 
     def _load_imagenet(self, arch: str) -> None:
         from torchvision.models import get_model_weights

@@ -84,8 +84,6 @@ class PoseModel(TrainedModule):
         self.view_loss = view_loss
         self.validation_loss = PairMean()
 
-    # ------------------------------------------------------------ use
-
     def encode(self, images: Tensor) -> Tensor:
         """Codes `[I, D]` of images `[I, 3, H, W]` in [-1, 1]."""
         return self.backbone(images)
@@ -97,8 +95,6 @@ class PoseModel(TrainedModule):
     @abstractmethod
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         """Score (and energy) at relative poses `[..., 3]` for conditions `[..., hidden]`, at the model's `sigma`."""
-
-    # ------------------------------------------------------------ training
 
     @abstractmethod
     def pair_loss(self, condition: Tensor, noised: Tensor, true: Tensor) -> Tensor:

@@ -43,8 +43,6 @@ class TrainedModule(LightningModule):
         self.schedule, self.seed = schedule, seed
         self._micro_batch = 0  # of an optimiser step, with trainer.accumulate_grad_batches
 
-    # ------------------------------------------------------------ training
-
     def extractor(self) -> FeatureExtractor | None:
         """What of an image the data module shall compute once and cache: the frozen trunk's features; else nothing."""
         return self.backbone if self.backbone.frozen else None
@@ -55,10 +53,7 @@ class TrainedModule(LightningModule):
         torch.manual_seed(self._step_key() + (1 << 62))
 
     def _generator(self) -> torch.Generator:
-        """Noise keyed by seed, step, micro-batch and process, so that a resumed run draws what an unbroken one does.
-
-        It is drawn on the CPU: a GPU gets the same.
-        """
+        """Noise keyed by seed, step, micro-batch and process, so resumed runs draw the same; on the CPU."""
         return torch.Generator().manual_seed(self._step_key())
 
     def _step_key(self) -> int:
@@ -80,8 +75,6 @@ class TrainedModule(LightningModule):
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    # ------------------------------------------------------------ checkpoints
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A frozen trunk comes with its backbone: its fingerprint is kept, its weights are left out."""
         checkpoint[RECIPE] = self.recipe
@@ -93,10 +86,7 @@ class TrainedModule(LightningModule):
             checkpoint[state] = {key: value for key, value in checkpoint[state].items() if key not in trunk}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Put the frozen trunk's weights back, so that the rest is still checked strictly.
-
-        Raises `UserError` when the trunk here is not the one that the rest was trained on.
-        """
+        """Put the frozen trunk's weights back; `UserError` where the rest was trained on another trunk."""
         if not self.backbone.frozen:
             return
         if checkpoint.get("trunk") != self.backbone.fingerprint():

@@ -95,11 +95,9 @@ class Langevin(Solver):
     def _distance(self, condition: Tensor, pose: Tensor) -> Tensor:
         """The distance `[B, N]` to the truth (radians, scene units) that the field tells, by Tweedie's formulas.
 
-        The mean offset from the truth is -sigma^2 s (first order): all of the distance where only one image of the
-        truth around the circle counts. Towards the antipode the images on either side cancel out and s vanishes; there
-        its slope s' along the longitude is positive, and the mean square, sigma^4 (s^2 + s') + sigma^2 (second order),
-        still tells the distance. Elsewhere that would only add the noise of a learned slope.
-        """
+        The mean offset from the truth is -sigma^2 s (first order). Towards the antipode, where s vanishes, its slope s'
+        along the longitude is positive, and the mean square, sigma^4 (s^2 + s') + sigma^2 (second order), still tells
+        the distance; elsewhere that would only add the noise of a learned slope."""
         variance = self.model.sigma**2
         step = 0.02 * variance * pose.new_tensor([0.0, 1.0, 0.0])
         score = self.model.field(condition, pose).score

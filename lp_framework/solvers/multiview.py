@@ -1,9 +1,4 @@
-"""The paper's Joint Reasoning across Multiple Views: one consistent set of poses for two and more images.
-
-1. `measure`: the first stage (Eq. 4) on all ordered pairs.
-2. `fit`: the absolute poses that most of its ends agree on (see `pose_graph`).
-3. `refine`: all poses together descend the sum of the prior's energies over the ordered pairs (Eq. 5).
-"""
+"""The paper's Joint Reasoning across Multiple Views: one consistent set of poses for two and more images."""
 
 from __future__ import annotations
 
@@ -122,12 +117,9 @@ class MultiView(Solver):
         return self.refine(view_sets, joint, seed) if self.second_stage else joint
 
     def measure(self, view_sets: ViewSets, starts: Tensor, seed: int) -> tuple[Tensor, Tensor, int]:
-        """1. The first stage's ends on all ordered pairs, each from the starts of its query relative to its reference:
-        relative poses `[S, V, V, N, 3]` (row: reference, column: query), their weights `[S, V, V, N]` (0: none), and
-        the passes they took.
-
-        A pair with the first image as query starts from the opposite of its reference's starts.
-        """
+        """1. The first stage's ends (Eq. 4) on all ordered pairs, each from the starts of its query relative to its
+        reference: relative poses `[S, V, V, N, 3]` (row: reference, column: query), their weights `[S, V, V, N]` (0:
+        none), and the passes they took."""
         sets, views = view_sets.views.shape
         reference, query = torch.tensor(list(permutations(range(views), 2))).T.tolist()
         back = relative_pose(starts, torch.zeros_like(starts))
@@ -142,7 +134,7 @@ class MultiView(Solver):
         return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
     def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """2. One answer a set, `[S, 1, V - 1, 3]`; it is valid, `[S, 1]`, where every image has been measured."""
+        """2. What most ends agree on: one answer a set, `[S, 1, V - 1, 3]`, valid, `[S, 1]`, with all images known."""
         poses = fit_views(measured, weights)[:, None, 1:].to(measured)
         known = (weights > 0).any(dim=-1)
         return poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True)
