@@ -69,8 +69,7 @@ class Prior(nn.Module, ABC):
         """Novel views `[B, 3, image_size, image_size]` in [-1, 1] of `source` under relative poses `[B, 3]`, by DDIM.
 
         `guidance` is the scale of classifier-free guidance (1: none), `eta` the share of fresh noise (0: none). All
-        views of a call have the same draws: they differ by source and pose alone.
-        """
+        views of a call have the same draws."""
 
     def train(self, mode: bool = True) -> Prior:
         """As every module, but a prior stays in evaluation mode."""
@@ -79,8 +78,9 @@ class Prior(nn.Module, ABC):
     def check(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> None:
         """`UserError` where the arguments of `residual` do not fit each other."""
         batch, latents = len(pose), {"target": target.latent, "source": source.latent, "noise": noise}
+        shapes: dict[str, tuple[int, ...]] = {**dict.fromkeys(latents, self.latent_shape), "pose": (3,), "timestep": ()}
         for name, tensor in {**latents, "pose": pose, "timestep": timestep}.items():
-            wanted = [batch, *(self.latent_shape if name in latents else (3,) if name == "pose" else ())]
+            wanted = [batch, *shapes[name]]
             if list(tensor.shape) != wanted:
                 raise UserError(f"{name} must be {wanted} for {batch} poses, got {list(tensor.shape)}")
         known = timestep.device.type == "cpu"  # looking at the values on a GPU would wait for it, at every step

@@ -149,10 +149,7 @@ class Solver(ABC):
 
     @abstractmethod
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """Solve all pairs from starts `[B, N, 3]` (relative poses), all together.
-
-        The result for a pair and start depends on them, on the pair's id and on `seed` alone.
-        """
+        """Solve all pairs from starts `[B, N, 3]`, all together. A result depends on its pair, start and `seed`."""
 
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """Solve sets of V images from starts `[S, V - 1, N, 3]`: N for each other view, relative to the first.

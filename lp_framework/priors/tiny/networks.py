@@ -120,7 +120,6 @@ def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
     """Codes `[..., code_dim]` (see `code_dim`) as seen from relative poses `[..., 3]` away.
 
     A wave of order m turns by m times the relative longitude, and the place moves by the relative latitude and radius.
-    So the result is periodic in longitude, and `steer` by x, then by y, is `steer` by x + y.
     """
     constant, waves, place = code[..., :CONSTANT], code[..., CONSTANT:-2], code[..., -2:]
     real, imaginary = waves.unflatten(-1, (2, orders, WAVES)).unbind(dim=-3)

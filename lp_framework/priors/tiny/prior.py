@@ -133,7 +133,7 @@ class PriorModel(TrainedModule):
     def _denoise(
         self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor
     ) -> tuple[Tensor, Gaussian]:
-        """Denoising errors `[P]` of the pairs' queries seen from their references, and what was predicted."""
+        """Denoising errors `[P]` of the queries seen from their references, and what was predicted."""
         alpha = self.alphas_cumprod[timestep][:, None]
         noisy = alpha.sqrt() * latents[batch.query] + (1 - alpha).sqrt() * noise
         predicted = self.networks.predict(code[batch.reference], batch.relative_poses())
