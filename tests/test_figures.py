@@ -41,8 +41,7 @@ from lp_framework.geometry import apply_relative_pose, relative_pose
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.solvers.base import Pairs
 from lp_framework.viz.cameras import RED, CameraScene, camera_methods_figure, colour_of
-from lp_framework.viz.maps import ends_in_words, minima_in_words
-from lp_framework.viz.panels import FailureRow, failures_figure
+from lp_framework.viz.maps import FailureRow, ends_in_words, failures_figure, minima_in_words
 
 CPU = torch.device("cpu")
 VIEWS = torch.tensor([[0.1, 0.4, 1.5], [0.3, 2.9, 1.7], [-0.2, 5.0, 1.3], [0.0, 1.0, 1.6]])

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS, write_csv, write_json, write_text
+from lp_framework.report.page import HEADINGS, Section, number, render
 from lp_framework.report.paper import PaperTable, paper_table
-from lp_framework.report.parts import HEADINGS, Section, number, render
 from lp_framework.report.runs import COSTS, LeftOut, Run, checkpoint_names
 
 Objects = Literal["unique_answer", "all"]

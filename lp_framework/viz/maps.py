@@ -1,10 +1,13 @@
-"""Maps of relative latitude and longitude, and in 3-D: energies, scores, and the ways that a solver took over them."""
+"""Maps of relative latitude and longitude, and in 3-D: energies, scores, and the ways that a solver took over them.
+
+Of one pair with its images, and the paper's figures of several.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +22,8 @@ from numpy.typing import NDArray
 
 from lp_framework.analysis.landscapes import FLAT, Landscape, LandscapeMinimum
 from lp_framework.analysis.pairs import PoseMap, ShownPair
-from lp_framework.viz.style import ANSWER, DENSITY, FAINT, INK, MAGNITUDE, OTHERS, TRUTH, Sheet, degrees, styled
+from lp_framework.viz import style
+from lp_framework.viz.style import ANSWER, ASIDE, FAINT, INK, OTHERS, TRUTH, Sheet, degrees, letter, styled
 
 SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it
 # From dark valleys to light heights, evenly in lightness, so that grey and any kind of colour vision see the same.
@@ -28,14 +32,20 @@ LEVELS = 9  # contour lines
 
 # Of the page of a pair, in inches: its width, margins, and the room between images and maps for labels; the maps'
 # colour bar; the maps' labels and their key; between maps; a line above an image; sides of images.
-WIDTH, SIDE, TOP, LABELS, BAR = 8.0, 0.1, 0.74, 0.62, 0.78
+PAGE_WIDTH, MARGIN, TOP, PAGE_LABELS, BAR = 8.0, 0.1, 0.74, 0.62, 0.78
 BELOW, BETWEEN, CAPTION = 0.66, 0.38, 0.2
 IMAGE, LARGEST_VIEW = 1.72, 1.2
 
+# Of the paper's figures, in inches: width and margin, room for a title, gaps; maps, and the room for their labels.
+WIDTH, SIDE, TITLE, GAP = 7.0, 0.06, 0.24, 0.05
+TALL, WIDE, LABELS, BOTTOM = 1.16, 1.55, 0.46, 0.4
+COLUMNS = 3  # of surfaces
+SMALL = {**ASIDE, "fontsize": 7.0}
+
 
 def _mark(marker: str, size: float, face: str, edge: str, width: float, **others: Any) -> dict[str, Any]:
-    style = {"markersize": size, "markerfacecolor": face, "markeredgecolor": edge, "markeredgewidth": width}
-    return {"linestyle": "none", "marker": marker, **style, **others}
+    look = {"markersize": size, "markerfacecolor": face, "markeredgecolor": edge, "markeredgewidth": width}
+    return {"linestyle": "none", "marker": marker, **look, **others}
 
 
 TRUTH_MARK = _mark("*", 14, TRUTH, INK, 0.8)
@@ -56,7 +66,7 @@ def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: 
     degrees(axes, "y", 30)
     low, high, drawn = -limit, limit, None
     if content.density is not None:  # light below arrows
-        _draw_ground(axes, content.density, RELIEF if content.arrows is None else DENSITY, Normalize(0, 1))
+        _draw_ground(axes, content.density, RELIEF if content.arrows is None else style.DENSITY, Normalize(0, 1))
     if content.relief is not None:
         drawn = _draw_ground(axes, content.relief, RELIEF)
         low, high = (math.degrees(content.relief.latitude[end].item()) for end in (0, -1))
@@ -68,7 +78,7 @@ def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: 
         latitude, longitude, score, _ = content.arrows
         drawn = axes.quiver(
             longitude, latitude, score[..., 1], score[..., 0], content.arrows.lengths(),
-            cmap=MAGNITUDE, norm=Normalize(0, scale), angles="xy", scale_units="xy",
+            cmap=style.MAGNITUDE, norm=Normalize(0, scale), angles="xy", scale_units="xy",
             scale=scale * len(longitude) / (1.15 * 360),  # the longest is about as long as columns are apart
             pivot="mid", units="inches", width=0.0125, headwidth=4, headlength=4.5, headaxislength=4,
             minlength=0.5, zorder=1,
@@ -186,20 +196,20 @@ def pair_figure(
     Views, `[H, W, 3]` each, are what the prior generates at the ends. The maps have one scale.
     """
     limit = _limit(pair.truth, maps)
-    left = SIDE + IMAGE + LABELS
-    wide = WIDTH - left - BAR
+    left = MARGIN + IMAGE + PAGE_LABELS
+    wide = PAGE_WIDTH - left - BAR
     high = wide * limit / 180
     tall = len(maps) * (high + BETWEEN) - BETWEEN
     columns = max(1, min(len(views), 5))
     view = min(LARGEST_VIEW, (wide - 0.1 * (columns - 1)) / columns)
     below = tall + BELOW + bool(views) * CAPTION + -(-len(views) // columns) * (view + CAPTION)
     content = max(2 * IMAGE + CAPTION, below)
-    sheet = Sheet(WIDTH, TOP + content + SIDE)
+    sheet = Sheet(PAGE_WIDTH, TOP + content + MARGIN)
     sheet.head(title, note)
-    sheet.image(SIDE, TOP, IMAGE, pair.reference.image, "reference")
+    sheet.image(MARGIN, TOP, IMAGE, pair.reference.image, "reference")
     top = TOP + (content - below) / 2
     lower = top + high + BETWEEN if len(maps) > 1 else TOP + content - IMAGE
-    sheet.image(SIDE, lower, IMAGE, pair.query.image, "query")
+    sheet.image(MARGIN, lower, IMAGE, pair.query.image, "query")
     for row, each in enumerate(maps):
         axes = sheet.axes(left, top + row * (high + BETWEEN), wide, high)
         drawn = draw_map(axes, each, pair.truth, limit)
@@ -302,3 +312,154 @@ def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:
     shown = [each.ends[each.chosen] for each in solved] + ([] if truth is None else [truth])
     furthest = max((abs(math.degrees(pose[0])) for pose in shown if math.isfinite(pose[0])), default=0.0)
     return min(180.0, max(60.0, 15.0 * math.ceil((furthest + 2) / 15)))
+
+
+@styled
+def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
+    """A column a pair: reference and query above the surface of the prior's energy, whose height is its own range."""
+    columns = min(COLUMNS, len(pairs))
+    wide, image, tall = (WIDTH - 2 * SIDE) / columns, 0.96, 1.72
+    sheet = Sheet(WIDTH, -(-len(pairs) // columns) * (TITLE + image + tall))
+    for number, pair in enumerate(pairs):
+        row, column = divmod(number, columns)
+        x, y = SIDE + column * wide, row * (TITLE + image + tall) + TITLE
+        sheet.above(x, y, letter(number, pair.title))
+        for place, view in enumerate((pair.reference, pair.query)):
+            sheet.image(x + place * (image + GAP), y, image, view.image)
+        sheet.above(x + 2 * image + GAP, y, minima_in_words(pair.prior_energy), ha="right", **ASIDE)
+        axes = small_surface(sheet, x - 0.06, y + image + 0.02, wide + 0.04, tall - 0.1, pair.prior_energy, pair.truth)
+        axes.set_xlabel("longitude", fontsize=7, labelpad=-8)
+        axes.set_ylabel("latitude", fontsize=7, labelpad=-8)
+    return sheet.figure
+
+
+@styled
+def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -> Figure:
+    """(a), (b) both images; (c) a row a trajectory, of `views` `[N, K, H, W, 3]` at `steps`; (d) the landscape."""
+    view, label, bottom = 0.58, 0.5, 0.06
+    tall = max(2.7, 0.18 + len(views) * (view + GAP) - GAP)
+    image = min(1.1, (tall - TITLE) / 2)
+    sheet = Sheet(WIDTH, TITLE + tall + bottom)
+    for number, (name, each) in enumerate((("reference", pair.reference), ("query", pair.query))):
+        y = TITLE + number * (tall - image)
+        sheet.image(SIDE, y, image, each.image)
+        sheet.above(SIDE, y, letter(number, name))
+    left = SIDE + image + 0.12
+    sheet.above(left, TITLE, "(c) generated on the way")
+    for column, step in enumerate(steps):
+        sheet.text(left + label + column * (view + GAP) + view / 2, TITLE + 0.12, f"step {step}", ha="center", **SMALL)
+    for number, (row, (start, off)) in enumerate(zip(views, ends_in_words(pair), strict=True)):
+        y = TITLE + 0.18 + number * (view + GAP)
+        answer = number == pair.chosen
+        look: Any = {"fontsize": 7, "color": ANSWER if answer else INK}
+        sheet.text(left, y + view / 2, f"from {start}", va="bottom", **look)
+        sheet.text(left, y + view / 2, off, va="top", **look)
+        for column, picture in enumerate(row):
+            frame: Any = {"color": ANSWER, "linewidth": 1.2} if answer else {}
+            sheet.image(left + label + column * (view + GAP), y, view, picture, **frame)
+    x = left + label + len(steps) * (view + GAP) + 0.44
+    wide = WIDTH - SIDE - x
+    high = wide * 0.52
+    sheet.above(x, TITLE, "(d) landscape")
+    _place_map(sheet, (x, TITLE, wide, high), PoseMap(relief=pair.prior_energy, ways=pair), pair.truth)
+    lower = TITLE + high + 0.26
+    small_surface(sheet, x - 0.2, lower, wide + 0.2, sheet.height - lower + 0.02, pair.prior_energy, pair.truth)
+    return sheet.figure
+
+
+class FailureRow(NamedTuple):
+    """A pair and views around the object, `[K, H, W, 3]`: rendered from its mesh (None where there is none) and
+    generated by the prior.
+    """
+
+    pair: ShownPair
+    rendered: NDArray | None
+    generated: NDArray
+
+
+@styled
+def failures_figure(rows: Sequence[FailureRow]) -> Figure:
+    """A row a pair: reference above query, views evenly around, rendered above generated, the landscape."""
+    longitudes = [360 * place / len(rows[0].generated) for place in range(len(rows[0].generated))]
+    image, wide = 0.7, 1.72
+    block = 2 * image + GAP
+    sheet = Sheet(WIDTH, TITLE + len(rows) * (block + TITLE) + 0.3)
+    left, right = SIDE + image + 0.42, WIDTH - SIDE - wide
+    view = min(image, (right - 0.55 - left + GAP) / len(longitudes) - GAP)
+    for x, title in ((SIDE, "(a) pair"), (left, "(b) turned around the object"), (right, "(c) landscape")):
+        sheet.above(x, TITLE, title)
+    for number, (pair, *swept) in enumerate(rows):
+        upper = 2 * TITLE + number * (block + TITLE)
+        sheet.above(SIDE, upper, pair.title, **ASIDE)
+        for place, each in enumerate((pair.reference, pair.query)):
+            sheet.image(SIDE, upper + place * (image + GAP), image, each.image)
+        lines = [(name, views) for name, views in zip(("mesh", "prior"), swept, strict=True) if views is not None]
+        top = upper + block / 2 - (len(lines) * (view + GAP) - GAP) / 2
+        for line, (name, views) in enumerate(lines):
+            y = top + line * (view + GAP)
+            sheet.text(left - 0.08, y + view / 2, name, fontsize=7.5, rotation=90, ha="right", va="center")
+            for column, picture in enumerate(views):
+                sheet.image(left + column * (view + GAP), y, view, picture)
+        for column, longitude in enumerate(longitudes):
+            sheet.above(left + column * (view + GAP) + view / 2, top, f"{longitude:g}°", ha="center", **SMALL)
+        box, last = (right, upper, wide, block - 0.1), number == len(rows) - 1
+        _place_map(sheet, box, PoseMap(relief=pair.prior_energy), pair.truth, last=last)
+    return sheet.figure
+
+
+@styled
+def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
+    """(a) reference and query, then the pair's four maps and exp(-E) of two energies by title, in two rows."""
+    sheet = Sheet(WIDTH, 2 * (TITLE + TALL) + BOTTOM)
+    left = SIDE + TALL + LABELS
+    right = left + 2 * (WIDE + 0.12)
+    for row, (view, name) in enumerate(((pair.reference, "(a) reference"), (pair.query, "query"))):
+        y = TITLE + row * (TITLE + TALL)
+        sheet.image(SIDE, y, TALL, view.image)
+        sheet.above(SIDE, y, name)
+    for number, content in enumerate(pair.maps):
+        row, column = divmod(number, 2)
+        x, y = left + column * (WIDE + 0.12), TITLE + row * (TITLE + TALL)
+        sheet.above(x, y, letter(number + 1, content.title))
+        _place_map(sheet, (x, y, WIDE, TALL), content, pair.truth, first=column == 0, last=row == 1)
+    for row, (title, density) in enumerate(densities.items()):
+        y = TITLE + row * (TITLE + TALL)
+        sheet.above(right, y, letter(len(pair.maps) + 1 + row, title))
+        small_surface(sheet, right - 0.12, y - 0.1, WIDTH - right + 0.06, TALL + 0.15, density, pair.truth)
+    return sheet.figure
+
+
+@styled
+def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figure:
+    """A row a pair: reference above query, and its maps, their own titles small; `titles` are those of the columns."""
+    gap = 0.2
+    side = (TALL - GAP) / 2
+    left = SIDE + side + LABELS + 0.08
+    wide = (WIDTH - SIDE - left - 2 * gap) / 3
+    sheet = Sheet(WIDTH, TITLE + len(pairs) * (TITLE + TALL) + BOTTOM)
+    sheet.above(SIDE, TITLE, "(a) pair")
+    for column, title in enumerate(titles):
+        sheet.above(left + column * (wide + gap), TITLE, letter(column + 1, title))
+    for number, pair in enumerate(pairs):
+        y = 2 * TITLE + number * (TITLE + TALL)
+        sheet.above(SIDE, y, pair.title, **ASIDE)
+        for place, view in enumerate((pair.reference, pair.query)):
+            sheet.image(SIDE, y + place * (side + GAP), side, view.image)
+        for column, content in enumerate(pair.maps):
+            x, last = left + column * (wide + gap), number == len(pairs) - 1
+            sheet.above(x + wide, y, content.title, ha="right", **ASIDE)
+            _place_map(sheet, (x, y, wide, TALL), content, pair.truth, first=column == 0, last=last)
+    return sheet.figure
+
+
+def _place_map(
+    sheet: Sheet, box: Sequence[float], content: PoseMap, truth: NDArray | None, first: bool = True, last: bool = True
+) -> None:
+    """A small map without its title, labelled where it is the first of its row and in the last one."""
+    axes = sheet.axes(*box)
+    draw_map(axes, content._replace(title=""), truth)
+    axes.set(xticks=[0, 90, 180, 270], yticks=[-30, 0, 30])
+    axes.tick_params(pad=2, labelleft=first, labelbottom=last)
+    small_marks(axes)
+    axes.set_ylabel("latitude" if first else "", labelpad=0)
+    axes.set_xlabel("longitude" if last else "", labelpad=1)

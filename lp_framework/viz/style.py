@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, ParamSpec
+from typing import Any, Literal
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -29,18 +28,8 @@ DENSITY = LinearSegmentedColormap.from_list("density", ["#FFFFFF", "#E9E4DA", "#
 
 SETTINGS = matplotlib.rc_params_from_file(Path(__file__).with_name("look.mplstyle"), use_default_template=False)
 
-_Parameters = ParamSpec("_Parameters")
-
-
-def styled(draw: Callable[_Parameters, Figure]) -> Callable[_Parameters, Figure]:
-    """A plotting function whose figure has the common look, whatever the caller's settings are."""
-
-    @functools.wraps(draw)
-    def drawn(*arguments: _Parameters.args, **named: _Parameters.kwargs) -> Figure:
-        with matplotlib.rc_context(SETTINGS):
-            return draw(*arguments, **named)
-
-    return drawn
+# Of a plotting function: its figure has the common look, whatever the caller's settings are.
+styled = matplotlib.rc_context(SETTINGS)
 
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:

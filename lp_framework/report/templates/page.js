@@ -1,8 +1,6 @@
 "use strict";
 // Tables that sort, plots that are drawn when they come into view, and pairs along whose ways a slider moves the marks.
 (() => {
-  // ------------------------------------------------------------ tables
-
   for (const table of document.querySelectorAll("table[data-sorts]")) {
     const heads = [...table.tHead.rows[0].cells];
     heads.forEach((head, column) =>
@@ -33,8 +31,6 @@
     return Number.isNaN(number) || cell.classList.contains("word") ? text : number;
   }
 
-  // ------------------------------------------------------------ runs of a set
-
   function openRun() {
     const run = location.hash && document.getElementById(location.hash.slice(1));
     if (run instanceof HTMLDetailsElement) {
@@ -44,8 +40,6 @@
   }
   addEventListener("hashchange", openRun);
   openRun();
-
-  // ------------------------------------------------------------ plots
 
   async function unpack(packed) {
     const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
@@ -98,8 +92,6 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     for (const element of drawn.keys()) draw(element);
   });
-
-  // ------------------------------------------------------------ pairs
 
   for (const pairs of document.querySelectorAll(".pairs")) {
     const [cards, stages] = [".card", ".stage"].map((name) => [...pairs.querySelectorAll(name)]);
