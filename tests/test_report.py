@@ -56,8 +56,8 @@ def test_a_run_without_hydras_folder_has_no_experiment(tmp_path):
     [
         ("", "damaged: .*results.json cannot be read"),
         ('{"metrics": {"R@5": 0.', "damaged: .*results.json cannot be read"),
-        ('{"weight": 3}', "is not the result of an evaluation, or one of another version"),
-        ("[1, 2]", "is not the result of an evaluation"),
+        ('{"weight": 3}', r"cannot be read as the result of an evaluation \(KeyError"),
+        ("[1, 2]", "cannot be read as the result of an evaluation"),
         (None, "unfinished: no results.json"),
     ],
 )

@@ -37,12 +37,8 @@ class IDPosePair(NamedTuple):
 
 
 def read_idpose_results(folder: str | Path, objects: Sequence[str]) -> list[IDPosePair]:
-    """The results for `objects` in a folder.
-
-    Raises `UserError` naming the file that is malformed or about no known object.
-    """
-    folder = Path(folder)
-    files = sorted([*folder.glob("*.json"), *folder.glob("*/pose.json")])
+    """The results for `objects` in a folder; `UserError` names a file that is malformed or about no known object."""
+    files = sorted([*Path(folder).glob("*.json"), *Path(folder).glob("*/pose.json")])
     if not files:
         raise UserError(f"{folder}: holds no results of ID-Pose; looked for {folder}/*/pose.json and {folder}/*.json")
     return [pair for file in files for pair in _pairs(file, objects)]
@@ -70,10 +66,7 @@ def _pairs(file: Path, objects: Sequence[str]) -> list[IDPosePair]:
 
 
 def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
-    """Metrics as `PoseMetrics.compute` gives them, over all pairs of the results.
-
-    Of the scene, scaled so that the reference stands at 1.85; the true camera is the one on record.
-    """
+    """Metrics as `PoseMetrics.compute` gives them, over all pairs, in units where the reference stands at 1.85."""
     names = omni3d_objects(views)
     pairs = read_idpose_results(results, names)
     cameras = {name: omni3d_cameras(views, name) for name in {pair.object for pair in pairs}}
@@ -82,9 +75,9 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
             raise UserError(f"{results}: has views whose {views}/{name}/poses/{missing.pop()}.npy is missing")
     reference = torch.stack([cameras[pair.object][pair.reference] for pair in pairs])
     query = torch.stack([cameras[pair.object][pair.query] for pair in pairs])
-    scale = RADIUS / reference[:, :3, 3].norm(dim=-1)
-    for camera in (reference, query):
-        camera[:, :3, 3] *= scale[:, None]
+    scale = RADIUS / reference[:, :3, 3].norm(dim=-1, keepdim=True)
+    reference[:, :3, 3] *= scale
+    query[:, :3, 3] *= scale
     poses = torch.stack([pair.pose for pair in pairs])
     predicted = camera_to_world(apply_relative_pose(view_pose(reference), poses))
     metrics = PoseMetrics(names, ["unlabelled"] * len(names), [None] * len(names))

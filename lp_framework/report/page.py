@@ -166,10 +166,7 @@ def write_run_page(folder: Path, kind: Kind) -> Path:
 
 
 def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> Path:
-    """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened.
-
-    It is written whole or not at all.
-    """
+    """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened."""
     if len(runs) == 1:
         ((folder, kind),) = runs
         part = PARTS[kind][1](folder)

@@ -19,10 +19,7 @@ import yaml
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of a table: its label in the paper, the settings of the run to compare with, and what the paper has.
-
-    `data` is the row's data set by its name here, None in a table of one.
-    """
+    """A row of a table; `data` is its data set by its name here, None in a table of one."""
 
     label: str
     settings: Mapping[str, Any]
@@ -32,7 +29,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper; `settings` are the keys in which its rows differ."""
+    """A table of the paper; see the files."""
 
     name: str
     title: str
@@ -45,10 +42,7 @@ class PaperTable:
     rows: Sequence[PaperRow]
 
     def matching(self, settings: Mapping[str, Any]) -> list[PaperRow]:
-        """The rows to put beside a run with these settings: all that they name is set so in the run.
-
-        A run on a data set of the table is compared with that one's rows alone.
-        """
+        """The rows whose settings a run has; of a data set of the table that one's rows alone."""
         rows = [row for row in self.rows if row.settings.items() <= settings.items()]
         return [row for row in rows if row.data is not None and row.data == settings.get("data.name")] or rows
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -53,12 +53,9 @@ OUTLINE = [0, 1, 2, 3, 0, 4, 1, 2, 4, 3]  # all edges of a frustum in one line
 Points = Callable[[NDArray], NDArray]  # from poses [S, 3] to points [T, 2] of the map, or [T, 3] in space
 
 
-class Moving(NamedTuple):
-    """A trace that the frames move: its number, ways `[_, S, 3]`, and where a step of those is drawn."""
-
-    trace: int
-    paths: NDArray
-    place: Points
+Moving = tuple[
+    int, NDArray, Points
+]  # of a trace that the frames move: its number, ways [_, S, 3], where they are drawn
 
 
 def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
@@ -85,10 +82,7 @@ def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
 
 
 def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
-    """Losses by their logged names over the steps, and below them the learning rate where there is one.
-
-    Where there are many records they are pale, and their running mean is drawn over them.
-    """
+    """Losses by their logged names over the steps, many of them pale behind their running mean; the learning rate."""
     loss = {"type": "log", "domain": [0 if rate is None else 0.32, 1], "dtick": "D2", "tickformat": "~g"}
     below = {"domain": [0, 0.22], "rangemode": "tozero", "nticks": 3, "exponentformat": "e"}
     figure = _figure(
@@ -214,7 +208,7 @@ def pair_cameras_plot(pair: ShownPair) -> go.Figure:
     _add_trails(figure, pair, centres, (OTHERS, ANSWER), (2, 5))
     moving = _add_moving(figure, pair, centres, OTHERS, (4, 6))
     figure.add_trace(_line(outline(answer[:, -1]), ANSWER, 5))
-    return _framed(figure, pair, [*moving, Moving(len(figure.data) - 1, answer, outline)])
+    return _framed(figure, pair, [*moving, (len(figure.data) - 1, answer, outline)])
 
 
 def _parts(pair: ShownPair) -> tuple[NDArray, NDArray]:
@@ -248,17 +242,17 @@ def _add_trails(
 def _add_moving(
     figure: go.Figure, pair: ShownPair, place: Points, others: str, sizes: Sequence[float], **more: Any
 ) -> list[Moving]:
-    moving = []
+    moving: list[Moving] = []
     kinds = (("another start", others, "circle"), ("answer", ANSWER, "diamond"))
     for paths, (name, colour, symbol), size in zip(_parts(pair), kinds, sizes, strict=True):
-        moving.append(Moving(len(figure.data), paths, place))
+        moving.append((len(figure.data), paths, place))
         _add_marks(figure, place(paths[:, -1]), name, colour, size, symbol=symbol, **more)
     return moving
 
 
 def _framed(figure: go.Figure, pair: ShownPair, moving: Sequence[Moving]) -> go.Figure:
-    frames = [[_xyz(each.place(each.paths[:, step])) for each in moving] for step in frame_steps(pair)]
-    return figure.update_layout(meta={"traces": [each.trace for each in moving], "frames": frames})
+    frames = [[_xyz(place(paths[:, step])) for _, paths, place in moving] for step in frame_steps(pair)]
+    return figure.update_layout(meta={"traces": [trace for trace, *_ in moving], "frames": frames})
 
 
 def _on_map(poses: NDArray) -> NDArray:

@@ -35,9 +35,8 @@ FILES: dict[str, Kind] = {
 class Run:
     """A finished evaluation: its folder, the experiment's name if it had one, and what was set.
 
-    `settings` are dotted keys of the config without seeds, and `checkpoint`: the model's. `metrics` are over `all`
-    objects, and over those with a `unique_answer` (None where no object is labelled so); both hold the cost, `COSTS`,
-    too. A median error that is not finite is infinite.
+    `settings` are those of `settings` and `checkpoint_setting`. `metrics` are over `all` objects, and over those with a
+    `unique_answer` (None where no object is labelled so), with `COSTS`. A median error that is not finite is infinite.
     """
 
     folder: Path
@@ -77,9 +76,8 @@ def run_kind(folder: Path) -> Kind | None:
 
 
 def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
-    """All finished evaluations in and below `folders`, and those that are unfinished, damaged or repeat another.
-
-    Raises `UserError` for a folder that is not there.
+    """All finished evaluations in and below `folders` (`UserError` for one that is not there), and those that are
+    unfinished, damaged or repeat another.
     """
     runs: dict[str, Run] = {}
     left_out: list[LeftOut] = []
@@ -113,10 +111,9 @@ def read_run(folder: Path) -> Run:
         )
     except FileNotFoundError as error:
         raise UserError(f"unfinished: no {RESULT}") from error
-    except (OSError, ValueError, RecursionError) as error:  # of JSON, too
-        raise UserError(f"damaged: {file} cannot be read ({error})") from error
-    except (KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise UserError(f"damaged: {file} is not the result of an evaluation, or one of another version") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        told = f"{type(error).__name__}: {error}"
+        raise UserError(f"damaged: {file} cannot be read as the result of an evaluation ({told})") from error
 
 
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,8 +133,8 @@ def settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
     """`{"checkpoint": ...}`, nothing for a solver without a model.
 
-    The value tells apart models that were trained differently, but not those that differ in their training's seed: the
-    training run's settings and which of its files it is, as JSON, where its folder is there, else the path.
+    Models that differ in their training's seed alone have one value: the training run's settings and which of its files
+    it is, as JSON, where its folder is there, else the path.
     """
     if checkpoint is None:
         return {}

@@ -77,8 +77,8 @@ def sweep_figure(table: SweepTable) -> Figure | None:
 
 
 def cost_figure(table: SweepTable) -> Figure | None:
-    """Rotation recall of each solver against its seconds a pair; None where there is one solver, where there are more
-    rows than colours, or where the table's own figure has the time.
+    """Rotation recall of each solver against its seconds a pair; None for one solver, for more rows than colours, or
+    where the table's own figure has the time.
     """
     solvers = [row.settings.get(SOLVER) for row in table.rows]
     if len(set(solvers)) < 2 or len(table.rows) > len(COLOURS) or is_swept(table, "start.count"):
@@ -177,7 +177,6 @@ def label(settings: Mapping[str, Any]) -> str:
 
 
 def _called(table: SweepTable, row: Row) -> str:
-    """A row by its solver, and by what differs among the rows of that."""
     siblings = [each.settings for each in table.rows if each.settings.get(SOLVER) == row.settings.get(SOLVER)]
     told = {key: value for key, value in row.settings.items() if any(each.get(key) != value for each in siblings)}
     return label({SOLVER: row.settings.get(SOLVER), **told})
@@ -199,9 +198,7 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
 def _panel(
     table: SweepTable, axis: str, title: str, xlabel: str, metrics: Mapping[str, str], by_time: bool = False
 ) -> Panel:
-    """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's,
-    over the values of `axis` or over the seconds a pair.
-    """
+    """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's."""
     curves, over = [], None if by_time else axis
     for rows in table.apart_from(axis):
         words = label({key: value for key, value in rows[0].settings.items() if key != axis})
@@ -215,7 +212,7 @@ def _panel(
 
 
 def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:
-    """A metric of rows over a setting, or over the seconds a pair."""
+    """A metric of rows over the setting `axis`, or over the seconds a pair."""
     x = [row.metrics.get(SECONDS, NONE).mean if axis is None else float(row.settings[axis]) for row in rows]
     mean, std = np.array([row.metrics[metric] for row in rows]).T
     return Curve(title, np.array(x), mean, std, rows[0].paper)

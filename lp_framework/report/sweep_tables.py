@@ -39,10 +39,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """The runs that differ in nothing but their seeds: what was set, of the table's columns, and the metrics.
-
-    Or a row of the paper, with its `source`, and no runs.
-    """
+    """Runs that differ in their seeds alone, or a row of the paper (no runs): what is set of the table's columns."""
 
     settings: Mapping[str, Any]
     metrics: Mapping[str, Spread]
@@ -61,8 +58,7 @@ class Row:
 class SweepTable:
     """The runs of one experiment (or those without one): a row for every combination of settings.
 
-    `columns` are the settings that vary and those that the paper's table varies; `common` holds those that all runs
-    share, and `paper` the paper's own table of this experiment, if it has one.
+    `columns` are the settings that vary here or in the paper's own table, `paper`; all runs share those in `common`.
     """
 
     experiment: str | None
@@ -83,15 +79,11 @@ class SweepTable:
         """The paper's rows, all or those to compare a run of these settings with."""
         if self.paper is None:
             return []
-        chosen = self.paper.rows if settings is None else self.paper.matching(settings)
-        return [
-            Row(
-                row.settings,
-                {name: Spread(value, math.nan) for name, value in row.metrics.items()},
-                source=f"paper: {row.label}",
-            )
-            for row in chosen
-        ]
+        rows = []
+        for row in self.paper.rows if settings is None else self.paper.matching(settings):
+            metrics = {name: Spread(value, math.nan) for name, value in row.metrics.items()}
+            rows.append(Row(row.settings, metrics, source=f"paper: {row.label}"))
+        return rows
 
     def with_paper(self) -> list[Row]:
         """The rows, each followed by the paper's to compare it with; the rest of the paper's are last."""
@@ -119,7 +111,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The fewest keys that tell the given settings apart, in their order.
+    """The fewest keys that tell the given settings apart, names first.
 
     A key that only some have (a solver's own setting) counts only if it varies among those; and a setting that the
     choice of its group says (`solver.steps`, where every `solver.name` has its own) is left out. Either comes back
@@ -137,7 +129,6 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     for key in keys:
         if told_apart([*chosen, key]) > told_apart(chosen):
             chosen.append(key)
-    # Names come first, so that a number's values stand together.
     return sorted(chosen, key=lambda key: (not key.endswith(".name"), keys.index(key)))
 
 
@@ -217,8 +208,7 @@ class Line(NamedTuple):
     paper: bool
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """A printed table: `labels` of its headings say what was set, the others are numbers."""
 
     headings: Sequence[str]
@@ -267,9 +257,8 @@ def _down(table: SweepTable) -> Layout:
     labels = [*map(heading, table.columns), "runs"]
     lines = []
     for row in table.with_paper():
-        cells = [shown(row.settings.get(key)) for key in table.columns] + [str(len(row.runs))]
-        if row.paper:
-            cells = [row.source] + [""] * len(table.columns)
+        ours = [*(shown(row.settings.get(key)) for key in table.columns), str(len(row.runs))]
+        cells = [row.source, *[""] * len(table.columns)] if row.paper else ours
         lines.append(Line([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
     return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
 
@@ -308,8 +297,7 @@ def _rounded(value: float | None) -> float | str | None:
     return round(value, 5) if math.isfinite(value) else "inf"
 
 
-@dataclass(frozen=True)
-class Sweep:
+class Sweep(NamedTuple):
     """A table of runs with its title, as it is printed, and with the files of its figures."""
 
     title: str
@@ -342,18 +330,12 @@ def write_sweeps(
     write_csv(folder / "report.csv", *csv_rows([sweep.table for sweep in sweeps]))
     text = render("report.md.j2", sweeps=sweeps, left_out=left_out, counted=counted(objects))
     write_text(folder / "report.md", text)
-    write_json(
-        folder / "report.json",
-        {
-            "objects": objects,
-            "tables": [_as_json(sweep) for sweep in sweeps],
-            "left_out": [{"folder": str(path), "reason": reason} for path, reason in left_out],
-            **about,
-        },
-    )
-
-
-def _as_json(sweep: Sweep) -> dict[str, Any]:
-    metrics = [{name: value._asdict() for name, value in row.metrics.items()} for row in sweep.table.rows]
-    rows = [{**asdict(row), "metrics": each} for row, each in zip(sweep.table.rows, metrics, strict=True)]
-    return {**asdict(sweep.table), "rows": rows, "figures": [file.name for file in sweep.files]}
+    tables = []
+    for sweep in sweeps:
+        rows = [
+            {**asdict(row), "metrics": {name: value._asdict() for name, value in row.metrics.items()}}
+            for row in sweep.table.rows
+        ]
+        tables.append({**asdict(sweep.table), "rows": rows, "figures": [file.name for file in sweep.files]})
+    missing = [{"folder": str(path), "reason": reason} for path, reason in left_out]
+    write_json(folder / "report.json", {"objects": objects, "tables": tables, "left_out": missing, **about})

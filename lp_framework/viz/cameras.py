@@ -51,9 +51,8 @@ def viewpoint(latitude: float, longitude: float) -> NDArray:
 
 
 def best_viewpoint(poses: NDArray) -> NDArray:
-    """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart: where
-    charges, one at each camera, one where its image is drawn, and four at the object, would have least energy.
-    """
+    """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart."""
+    # Where charges, one at each camera, one where its image is drawn, and four at the object, have least energy.
     centres = _cameras(poses)[:, :3, 3]
     points = np.concatenate([np.zeros((4, 3)), centres, centres * (1 - NEAR_BY)])
     elevation = math.radians(ELEVATION)

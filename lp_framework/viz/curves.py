@@ -42,10 +42,9 @@ def cumulative(errors: NDArray, end: float) -> tuple[NDArray, NDArray]:
 
 @styled
 def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, classes: Sequence[str]) -> Figure:
-    """Share of pairs within an error, one curve an ambiguity class.
+    """Share of pairs within an error, a curve an ambiguity class: the chosen start and, dashed, all of several.
 
     `rotation` (degrees) and `translation` (scene units) `[P, N]`, the chosen start `[P]`, and every pair's class `[P]`.
-    Solid: the chosen start. Dashed: all starts, where there are several.
     """
     figure = Figure(figsize=(8.0, 3.5))
     figure.set_layout_engine("constrained", wspace=0.06)
@@ -95,10 +94,7 @@ class Curve(NamedTuple):
 
 
 def read_losses(path: Path) -> tuple[dict[str, Curve], Curve | None]:
-    """The curves of `LOSSES`, and the learning rate, in a `metrics.csv` of Lightning's CSV logger, over its `step`.
-
-    Empty cells are left out; a file that is not there has no curves.
-    """
+    """The curves of `LOSSES` and the learning rate in Lightning's `metrics.csv`; none where there is no such file."""
     gathered: dict[str, list[tuple[float, float]]] = {}
     if path.is_file():
         with path.open(newline="", encoding="utf-8") as file:

@@ -73,9 +73,8 @@ def views_figure(
     source: NDArray, views: NDArray, latitudes_degrees: Sequence[float], longitudes_degrees: Sequence[float],
     title: str, note: str,
 ) -> Figure:  # fmt: skip
-    """The source `[H, W, 3]` beside views `[rows, columns, h, w, 3]` (uint8), a row a latitude, a column a longitude.
-
-    Angles are relative to the source; a view at (0, 0), its own pose, is framed.
+    """The source `[H, W, 3]` beside views `[rows, columns, h, w, 3]` (uint8), a row a latitude, a column a longitude,
+    relative to the source; a view at (0, 0), its own pose, is framed.
     """
     rows, columns = views.shape[:2]
     left = SIDE + SOURCE + LABELS
