@@ -159,9 +159,8 @@ def saved_config(file: Path) -> dict[str, Any]:
 def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
     """A name for every value of the setting `checkpoint`: the model's where that tells them apart, else the path."""
     paths = {run.settings["checkpoint"]: run.checkpoint for run in runs if run.checkpoint is not None}
-    models = {
-        value: path if value == path else json.loads(value).get("model.name", path) for value, path in paths.items()
-    }
+    named = {value: path for value, path in paths.items() if value != path}
+    models = paths | {value: json.loads(value).get("model.name", path) for value, path in named.items()}
     return models if len(set(models.values())) == len(models) else paths
 
 

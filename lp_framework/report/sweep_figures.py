@@ -19,13 +19,17 @@ from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.report.sweep_tables import Row, Spread, Sweep, SweepTable, heading, layout, shown
 from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, VERMILION, open_frame, save_figure, styled
 
-AXES = ("views", "start.count", "solver.gamma")  # numbers with a figure of their own, the first that varies wins
+# Numbers with a figure of their own, and its horizontal axis; the first that varies wins.
+AXES = {
+    "views": "number of images",
+    "start.count": "number of starts",
+    "solver.gamma": "noise scale \u03b3 of the longitude",
+}
 RECALL, SUCCESS, ROTATION_RECALL = (
     [f"{prefix}@{degrees}" for degrees in ROTATION_THRESHOLDS] for prefix in ("R", "SR", "R(R)")
 )
 PANELS = {"Recall R (chosen start)": RECALL, "Success rate SR (all starts)": SUCCESS}
 WITHIN = [f"within {degrees}°" for degrees in ROTATION_THRESHOLDS]
-NOISE = "noise scale \u03b3 of the longitude"
 TIME = "seconds a pair (log scale)"
 SECONDS, SOLVER = "seconds_per_pair", "solver.name"
 NONE = Spread(math.nan, math.nan)
@@ -184,20 +188,18 @@ def _called(table: SweepTable, row: Row) -> str:
 
 def _panels(table: SweepTable, axis: str) -> list[Panel]:
     if axis == "views":
-        return [_panel(table, axis, name, "number of images", {"": name}) for name in ("R@15", "R@30")]
+        return [_panel(table, axis, name, {"": name}) for name in ("R@15", "R@30")]
     if axis == "start.count":
         first, *_, last = sorted({row.settings[axis] for row in table.rows})
         by_time = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
-        by_count = _panel(table, axis, "R@30 by number of starts", "number of starts", {"": "R@30"})
-        return [by_count, _panel(table, axis, by_time, TIME, {"": "R@30"}, by_time=True)]
+        by_count = _panel(table, axis, "R@30 by number of starts", {"": "R@30"})
+        return [by_count, _panel(table, axis, by_time, {"": "R@30"}, by_time=True)]
     if len(table.apart_from(axis)) > 1:  # a colour each
-        return [_panel(table, axis, f"{title}, {WITHIN[-1]}", NOISE, {"": each[-1]}) for title, each in PANELS.items()]
-    return [_panel(table, axis, title, NOISE, dict(zip(WITHIN, each, strict=True))) for title, each in PANELS.items()]
+        return [_panel(table, axis, f"{title}, {WITHIN[-1]}", {"": each[-1]}) for title, each in PANELS.items()]
+    return [_panel(table, axis, title, dict(zip(WITHIN, each, strict=True))) for title, each in PANELS.items()]
 
 
-def _panel(
-    table: SweepTable, axis: str, title: str, xlabel: str, metrics: Mapping[str, str], by_time: bool = False
-) -> Panel:
+def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str], by_time: bool = False) -> Panel:
     """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's."""
     curves, over = [], None if by_time else axis
     for rows in table.apart_from(axis):
@@ -208,7 +210,7 @@ def _panel(
             curves.append(_curve(called, rows, over, name))
             if theirs := [each for each in papers if name in each.metrics]:
                 curves.append(_curve(called, theirs, over, name))
-    return Panel(title, xlabel, curves, logarithmic=by_time)
+    return Panel(title, TIME if by_time else AXES[axis], curves, logarithmic=by_time)
 
 
 def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:

@@ -46,8 +46,7 @@ IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
 
 def viewpoint(latitude: float, longitude: float) -> NDArray:
     """Axes `[3, 3]` of a parallel projection from far away (radians): columns to the right, up, and towards us."""
-    axes: NDArray = camera_to_world(torch.tensor([latitude, longitude, 1.0], dtype=torch.float64))[:3, :3].numpy()
-    return axes
+    return np.asarray(camera_to_world(torch.tensor([latitude, longitude, 1.0], dtype=torch.float64))[:3, :3])
 
 
 def best_viewpoint(poses: NDArray) -> NDArray:
@@ -55,8 +54,7 @@ def best_viewpoint(poses: NDArray) -> NDArray:
     # Where charges, one at each camera, one where its image is drawn, and four at the object, have least energy.
     centres = _cameras(poses)[:, :3, 3]
     points = np.concatenate([np.zeros((4, 3)), centres, centres * (1 - NEAR_BY)])
-    elevation = math.radians(ELEVATION)
-    viewpoints = [viewpoint(elevation, poses[0, 1] + math.radians(offset)) for offset in OFFSETS]
+    viewpoints = [viewpoint(math.radians(ELEVATION), poses[0, 1] + math.radians(offset)) for offset in OFFSETS]
     return min(viewpoints, key=lambda axes: np.sum(1 / (pdist(points @ axes[:, :2], "sqeuclidean") + 1e-6)).round(6))
 
 
@@ -71,8 +69,7 @@ def image_plane(camera: NDArray, distance: float, half_angle: float) -> NDArray:
 
 def _cameras(poses: NDArray) -> NDArray:
     """Camera-to-world matrices `[K, 4, 4]` of those view poses `[..., 3]` that are finite."""
-    cameras: NDArray = camera_to_world(torch.from_numpy(poses[np.isfinite(poses).all(axis=-1)])).numpy()
-    return cameras
+    return np.asarray(camera_to_world(torch.from_numpy(poses[np.isfinite(poses).all(axis=-1)])))
 
 
 # Points `[K, 3]` at distance 1 from the object, at latitude 0.

@@ -120,8 +120,7 @@ def running_mean(values: NDArray, window: int) -> NDArray:
     array([1.5, 3. , 4. , 5. ])
     """
     ones = np.ones(window)
-    mean: NDArray = np.convolve(values, ones, mode="same") / np.convolve(np.ones_like(values), ones, mode="same")
-    return mean
+    return np.asarray(np.convolve(values, ones, "same") / np.convolve(np.ones_like(values), ones, "same"))
 
 
 @styled
