@@ -56,9 +56,8 @@ def _pairs(file: Path, objects: Sequence[str]) -> list[IDPosePair]:
         if not poses or any(pose.shape != (3,) for pose in poses.values()):
             raise ValueError("three numbers each are wanted")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise UserError(
-            f"{file}: needs anchor_vid, and obs with rel_sph for each other view ({type(error).__name__}: {error})"
-        ) from error
+        told = f"{type(error).__name__}: {error}"
+        raise UserError(f"{file}: needs anchor_vid, and obs with rel_sph for each other view ({told})") from error
     named = [name for name in objects if f"_{name}_{anchor}+" in f"_{label}"]
     if not named:
         raise UserError(f"{file}: its name tells none of the objects {', '.join(objects)}")

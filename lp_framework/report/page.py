@@ -260,11 +260,8 @@ def _pairs(folder: Path, record: Record) -> dict[str, Any]:
 def _objects(result: Record, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
     found = {name: metrics for name, metrics in result["per_object"].items() if metrics is not None}
     order = sorted(found, key=lambda name: (found[name]["R(R)@15"], found[name].get("SR(R)@30", 0), name))
-    return {
-        "objects": {name: found[name] for name in order},
-        "classes_of": {row["object"]: row["ambiguity"] for row in rows},
-        "counts": Counter(row["object"] for row in rows),
-    }
+    classes, counts = {row["object"]: row["ambiguity"] for row in rows}, Counter(row["object"] for row in rows)
+    return {"objects": {name: found[name] for name in order}, "classes_of": classes, "counts": counts}
 
 
 def _errors(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
@@ -291,7 +288,7 @@ def _about_training(folder: Path, report: Record) -> About:
     title = f"{words(config['model']['name'])} model, trained on {config['data']['name']}"
     if not report:
         return title, "training that has not finished", best
-    counts = {key: str(report[key]) for key in ("epochs", "steps")}
+    counts = {key: str(report[key]) for key in ("epochs", "steps") if key in report}
     return title, f"training over {report['epochs']} epochs, seed {report['seed']}", best | counts
 
 
