@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from lp_framework.data.procedural import procedural_object
-from lp_framework.data.rendering.auto import AutoRenderer
+from lp_framework.data.rendering.pyrender_renderer import AutoRenderer
 from lp_framework.geometry import camera_to_world
 
 FILE = Path(__file__).parents[1] / "docs" / "pictures" / "procedural.png"

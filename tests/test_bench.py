@@ -35,7 +35,7 @@ from lp_framework.benchmarks.zero123 import (
 from lp_framework.commands.bench import MEASUREMENTS, paper_seconds, table
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
-from lp_framework.data.source import RenderingsData
+from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.geometry import wrap_angle
 from lp_framework.models.checkpoints import SHIPPED, load_model

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from view_folders import FIELD_OF_VIEW, draw_view, random_poses
 
-from lp_framework.data.camera_files import colmap_model, nerf_transforms
-from lp_framework.data.views import read_views
+from lp_framework.data.views import colmap_model, nerf_transforms, read_views
 from lp_framework.geometry import camera_to_world
 
 DEGREES = 49.1

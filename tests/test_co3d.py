@@ -25,9 +25,9 @@ from painted_cube import SIDES, photograph
 from PIL import Image
 
 from lp_framework import registry
+from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes
 from lp_framework.data.sets.co3d import CO3DData, mask_pixels, read_points
 from lp_framework.data.sets.converted import Photograph
-from lp_framework.data.sets.object_frame import frame_of_points, frame_of_silhouettes
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, geodesic_angle, view_pose

@@ -17,7 +17,7 @@ from lp_framework.data.pairs import as_images
 from lp_framework.data.rendering.renderer import Renderer, View
 from lp_framework.data.sets import rendered
 from lp_framework.data.sets.rendered import MeshData, ToyData
-from lp_framework.data.source import RenderingsData, ViewSource
+from lp_framework.data.views import RenderingsData, ViewSource
 from lp_framework.errors import UserError
 from lp_framework.geometry import relative_pose
 

@@ -33,7 +33,7 @@ from lp_framework.analysis.pairs import PRIOR_ENERGY, ShownPair, View, named_pai
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.sets.rendered import MeshData
-from lp_framework.data.source import RenderingsData
+from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.figures.landscapes import FailuresFigure, LandscapesFigure, TrajectoriesFigure
 from lp_framework.figures.results import CamerasFigure

@@ -26,13 +26,13 @@ from view_folders import draw_view, random_poses, transforms, write_split
 
 from lp_framework.data.cache import cached_array, decoded_views
 from lp_framework.data.meshes import load_scene
+from lp_framework.data.object_folders import ObjectLists, kept_lists
 from lp_framework.data.photographs import read_image
 from lp_framework.data.sets.co3d import CO3DData
 from lp_framework.data.sets.converted import is_converted
 from lp_framework.data.sets.hopev2 import HOPEv2Data
-from lp_framework.data.sets.object_labels import read_labels
-from lp_framework.data.sets.object_lists import ObjectLists, kept_lists
 from lp_framework.data.sets.omni3d import RADIUS, omni3d_cameras
+from lp_framework.data.sets.rendered import read_labels
 from lp_framework.data.views import read_views
 from lp_framework.evaluation.journal import Journal
 from lp_framework.evaluation.metrics import SolvedBatch

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lp_framework.data.sets.object_labels import Label, read_labels
+from lp_framework.data.sets.rendered import Label, read_labels
 from lp_framework.errors import UserError
 
 NAMES = ["mug", "teapot", "vase"]

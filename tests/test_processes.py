@@ -18,7 +18,7 @@ from tiny_runs import OBJECTS, ROOT, Commands, Ran
 from lp_framework import registry
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch
-from lp_framework.data.source import RenderingsData
+from lp_framework.data.views import RenderingsData
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.models.pose_model import ScoreModel
 

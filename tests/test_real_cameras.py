@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lp_framework.data.real_cameras import (
+    ObjectFrame,
     crop_field_of_view,
     crop_homography,
     effective_radii,
@@ -17,7 +18,6 @@ from lp_framework.data.real_cameras import (
     turn_towards_centre,
     z_up_to_y_up,
 )
-from lp_framework.data.sets.object_frame import ObjectFrame
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.geometry import (
     camera_to_world,

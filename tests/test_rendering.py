@@ -16,9 +16,8 @@ from PIL import Image
 from scanned_objects import write_bottle, write_mug
 
 from lp_framework.data.meshes import MeshObject, load_scene, normalise
-from lp_framework.data.rendering import auto, pyrender_renderer
-from lp_framework.data.rendering.auto import AutoRenderer
-from lp_framework.data.rendering.pyrender_renderer import PyrenderRenderer, offscreen_context
+from lp_framework.data.rendering import pyrender_renderer
+from lp_framework.data.rendering.pyrender_renderer import AutoRenderer, PyrenderRenderer, offscreen_context
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.rendering.renderer import Renderer, View, downsample
 from lp_framework.data.rendering.views import ViewProtocol, render_object, render_objects
@@ -287,7 +286,7 @@ def test_auto_takes_raycast_and_says_why(monkeypatch):
     def no_opengl() -> None:
         raise UserError("there is no OpenGL")
 
-    monkeypatch.setattr(auto, "offscreen_context", no_opengl)
+    monkeypatch.setattr(pyrender_renderer, "offscreen_context", no_opengl)
     with pytest.warns(UserWarning, match="raycast instead of pyrender: there is no OpenGL"):
         chosen = AutoRenderer()
     assert chosen.name == "raycast"

@@ -8,7 +8,7 @@ from view_folders import write_object
 
 from lp_framework import registry
 from lp_framework.data.meshes import load_scene, surfaces
-from lp_framework.data.sets.scanned import GSOData, OO3DData, load_gso
+from lp_framework.data.sets.rendered import GSOData, OO3DData, load_gso
 from lp_framework.errors import UserError
 
 

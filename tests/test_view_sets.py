@@ -15,7 +15,7 @@ from view_folders import write_objects
 
 from lp_framework.analysis.examples import read_examples
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.source import RenderingsData
+from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution

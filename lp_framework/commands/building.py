@@ -25,7 +25,7 @@ from torch import nn
 from lp_framework import registry
 from lp_framework.api import TINY_KNOWS, best_device
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.source import ViewSource
+from lp_framework.data.views import ViewSource
 from lp_framework.errors import UserError, one_line
 from lp_framework.models.checkpoints import describe, find_checkpoint, load_model
 

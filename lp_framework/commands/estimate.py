@@ -19,9 +19,8 @@ from torch import Tensor
 
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
-from lp_framework.data.camera_files import colmap_model, nerf_transforms
 from lp_framework.data.photographs import SIZE, photograph_files, prepared_photographs, save_png
-from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, colmap_model, nerf_transforms
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.geometry import apply_relative_pose

@@ -1,5 +1,5 @@
 """Where views come from, views on disk, and batches of pairs; importing the package registers sources and renderers."""
 
-from lp_framework.data import procedural, rendering, sets, source
+from lp_framework.data import procedural, rendering, sets, views
 
-__all__ = ["procedural", "rendering", "sets", "source"]
+__all__ = ["procedural", "rendering", "sets", "views"]

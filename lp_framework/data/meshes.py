@@ -67,9 +67,6 @@ class Surface:
     texture_coordinates: NDArray[np.float32] | None  # [3T, 2], v upwards
 
 
-# ---------------------------------------------------------------- loading
-
-
 def load_scene(path: str | Path) -> trimesh.Scene:
     """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...).
 
@@ -123,9 +120,6 @@ def fingerprint(scene: trimesh.Scene) -> str:
                 digest.update(str(array.shape).encode())
                 digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()[:16]
-
-
-# ---------------------------------------------------------------- surfaces
 
 
 def surfaces(scene: trimesh.Scene) -> list[Surface]:
@@ -196,9 +190,6 @@ def _corner_normals(triangles: NDArray[np.float64]) -> NDArray[np.float32]:
     corner, weighted = corner[near], areas[face_of_corner[other[near]]]
     normals = np.stack([np.bincount(corner, weighted[:, axis], len(points)) for axis in range(3)], axis=1)
     return trimesh.util.unitize(normals).astype(np.float32)
-
-
-# ---------------------------------------------------------------- colours
 
 
 def _has_colour(mesh: trimesh.Trimesh) -> bool:

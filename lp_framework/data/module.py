@@ -16,8 +16,7 @@ from torch.utils.data import DataLoader
 
 from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views, tracked
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
-from lp_framework.data.source import ViewSource
-from lp_framework.data.views import ObjectViews
+from lp_framework.data.views import ObjectViews, ViewSource
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import stable_id
 

@@ -32,9 +32,6 @@ SMALLEST = 16  # pixels; a smaller object in a photograph says too little
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
-# ---------------------------------------------------------------- files
-
-
 def photograph_files(images: str | Path | Sequence[str | Path]) -> list[Path]:
     """The image files of a folder, sorted by name, or those of a list, as given; at least two, or a `UserError`."""
     if isinstance(images, str | Path):
@@ -68,9 +65,6 @@ def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
 
 def _images_in(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != ".")
-
-
-# ---------------------------------------------------------------- reading
 
 
 @contextmanager
@@ -117,9 +111,6 @@ def array_image(array: ArrayLike, name: str) -> Image.Image:
             raise UserError(f"{name} must be uint8, or floats in [0, 1], got {values.dtype}")
         values = np.rint(values * 255).astype(np.uint8)
     return Image.fromarray(values)
-
-
-# ---------------------------------------------------------------- cutting out
 
 
 @cache
@@ -191,9 +182,6 @@ def _opacity(levels: Image.Image) -> Image.Image | None:
     top = high if low < high and ((values == low) | (values == high)).all() else 255
     stretched = (values.astype(np.float32) - low) * (255 / (top - low))
     return Image.fromarray(np.rint(stretched).astype(np.uint8))
-
-
-# ---------------------------------------------------------------- framing
 
 
 def crop_to_object(image: Image.Image, name: str) -> Image.Image:

@@ -1,5 +1,5 @@
 """Rendering: from meshes to views on disk. The renderers agree on light, silhouette and colour."""
 
-from lp_framework.data.rendering import auto, pyrender_renderer, raycast
+from lp_framework.data.rendering import pyrender_renderer, raycast
 
-__all__ = ["auto", "pyrender_renderer", "raycast"]
+__all__ = ["pyrender_renderer", "raycast"]

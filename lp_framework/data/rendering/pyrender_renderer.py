@@ -1,4 +1,4 @@
-"""`renderer=pyrender`: OpenGL without a display, by EGL or OSMesa.
+"""`renderer=pyrender`: OpenGL without a display, by EGL or OSMesa; and `renderer=auto`, which falls back on raycast.
 
 pyrender's shader has a physically based material; with metalness 0 and roughness 1 it comes to a Lambertian surface
 with a faint sheen. It decodes textures from sRGB and multiplies vertex colours, taken as linear, onto the lit result.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from lp_framework.data.meshes import Surface, surfaces
+from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, View, downsample
 from lp_framework.errors import UserError
 from lp_framework.registry import register
@@ -139,3 +141,22 @@ def _forget_opengl() -> None:
     """PyOpenGL binds to a platform when it is first imported: import it afresh, so that the next one has a chance."""
     for module in [name for name in sys.modules if name.partition(".")[0] in ("OpenGL", "pyrender")]:
         del sys.modules[module]
+
+
+@register("renderer", "auto")
+class AutoRenderer(Renderer):
+    """pyrender where there is OpenGL, else raycast with a warning that says why."""
+
+    def __init__(self) -> None:
+        self.chosen: Renderer = PyrenderRenderer()
+        try:
+            offscreen_context()
+        except UserError as error:
+            warnings.warn(f"rendering with raycast instead of pyrender: {error}", stacklevel=2)
+            self.chosen = RaycastRenderer()
+        self.name = self.chosen.name
+
+    def views(
+        self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
+    ) -> Iterator[View]:
+        return self.chosen.views(scene, camera_to_world, resolution, field_of_view_degrees)

@@ -24,26 +24,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lp_framework.data.cache import tracked
-from lp_framework.data.camera_files import nerf_transforms
 from lp_framework.data.meshes import MeshObject, fingerprint
-from lp_framework.data.object_folders import (
-    differences,
-    locked,
-    raise_failures,
-    read_record,
-    write_object,
-    write_transforms,
-)
+from lp_framework.data.object_folders import differences, locked, raise_failures, read_record, write_object
 from lp_framework.data.rendering.renderer import Renderer
-from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES
+from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, nerf_transforms, write_transforms
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import camera_to_world
 
 RECORD = "render.json"
 LATER = {"train_views": None, "depth": False}  # settings that records leave out at these values, as older ones do
-
-
-# ---------------------------------------------------------------- the protocol
 
 
 @dataclass(frozen=True)
@@ -116,9 +105,6 @@ def _steps(start: float, end: float, step: float) -> NDArray[np.floating]:
     return start + step * np.arange(math.floor((end - start) / step + 1e-9) + 1)
 
 
-# ---------------------------------------------------------------- one object
-
-
 def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> None:
     """Render an object into `<root>/<name>`, whole or not at all, unless it is there already.
 
@@ -164,8 +150,9 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
                         )
                     levels = np.rint(depth / DEPTH_UNIT).clip(0, 65535).astype(np.uint16)
                     Image.fromarray(levels).save(partial / split / "depth" / name, compress_level=1)
-            known = {} if obj.ambiguity == "unlabelled" else labels
-            write_transforms(partial / split, transforms["frames"], protocol.field_of_view_degrees, known)
+            if obj.ambiguity != "unlabelled":
+                transforms |= labels
+            write_transforms(partial / split, **transforms)
 
     write_object(folder, RECORD, record, write)
 
@@ -180,9 +167,6 @@ def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str | None:
         return None
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
     return differences({**LATER, **record["protocol"], "mesh": record.get("mesh")}, {**wanted, **mesh})
-
-
-# ---------------------------------------------------------------- many objects
 
 
 def render_objects(

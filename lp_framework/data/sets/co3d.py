@@ -28,12 +28,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from torch import Tensor
 
+from lp_framework.data.object_folders import drawn, kept_lists
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.reading import expecting, names_below, numbers, read_json
-from lp_framework.data.real_cameras import from_pytorch3d, ndc_intrinsics
+from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes, from_pytorch3d, ndc_intrinsics
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData, checked
-from lp_framework.data.sets.object_frame import frame_of_points, frame_of_silhouettes
-from lp_framework.data.sets.object_lists import drawn, kept_lists
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -107,9 +106,6 @@ class CO3DData(PhotographedData):
             raise UserError(f"{folder / sequence}: {error}") from error
 
 
-# ---------------------------------------------------------------- annotations
-
-
 def _of_sequence(file: Path, sequence: str) -> list[dict[str, Any]]:
     """The entries of a file of annotations that are of a sequence."""
     content = read_json(file)
@@ -151,9 +147,6 @@ def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | Non
 
 def _score(value: Any) -> float | None:
     return None if value is None or not math.isfinite(float(value)) else float(value)
-
-
-# ---------------------------------------------------------------- the object's frame
 
 
 def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: dict[str, float | None]) -> Annotated:

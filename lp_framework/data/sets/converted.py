@@ -28,14 +28,7 @@ from PIL import Image
 from torch import Tensor
 
 from lp_framework.data.cache import tracked
-from lp_framework.data.object_folders import (
-    differences,
-    locked,
-    raise_failures,
-    read_record,
-    write_object,
-    write_transforms,
-)
+from lp_framework.data.object_folders import LIST, differences, locked, raise_failures, read_record, write_object
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.real_cameras import (
     crop_field_of_view,
@@ -45,8 +38,7 @@ from lp_framework.data.real_cameras import (
     spherical_camera,
     turn_towards_centre,
 )
-from lp_framework.data.sets.object_lists import LIST
-from lp_framework.data.source import ViewSource
+from lp_framework.data.views import ViewSource, write_transforms
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import is_rotation, to_ifusion, view_pose
 from lp_framework.keyed_random import stable_id
@@ -233,9 +225,6 @@ class PhotographedData(ConvertedSource):
         }
 
 
-# ---------------------------------------------------------------- choosing
-
-
 class SphericalView(NamedTuple):
     """A photograph with the effective radius of its crop (units of the object's longest side), the angle of its virtual
     turn (degrees) and its perspective residual (units of the image's side)."""
@@ -280,9 +269,6 @@ def spread(directions: NDArray[np.floating], count: int, random: np.random.Gener
         chosen.append(int(nearest.argmin()))
         nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
     return np.array(chosen)
-
-
-# ---------------------------------------------------------------- pixels
 
 
 def crop(view: SphericalView, size: int) -> Image.Image:

@@ -22,12 +22,11 @@ from typing import Any, NamedTuple
 
 import torch
 
+from lp_framework.data.object_folders import ObjectLists, kept_lists
 from lp_framework.data.photographs import opened
 from lp_framework.data.reading import expecting, numbers, read_json
-from lp_framework.data.real_cameras import z_up_to_y_up
+from lp_framework.data.real_cameras import ObjectFrame, z_up_to_y_up
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData, checked
-from lp_framework.data.sets.object_frame import ObjectFrame
-from lp_framework.data.sets.object_lists import ObjectLists, kept_lists
 from lp_framework.errors import UserError
 from lp_framework.geometry import from_opencv, inverse, rigid_transform
 from lp_framework.registry import register

@@ -18,12 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.data.object_folders import write_transforms
 from lp_framework.data.photographs import read_image
 from lp_framework.data.reading import check_upright, expecting, names_below, numbers
 from lp_framework.data.real_cameras import z_up_to_y_up
 from lp_framework.data.sets.converted import ConvertedSource, frame
-from lp_framework.data.views import ObjectViews
+from lp_framework.data.views import ObjectViews, write_transforms
 from lp_framework.errors import UserError
 from lp_framework.geometry import rigid_transform
 from lp_framework.registry import register

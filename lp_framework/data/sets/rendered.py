@@ -1,26 +1,78 @@
-"""Sources that render meshes: the embedded objects, folders of meshes."""
+"""Sources that render meshes: the embedded objects, folders of meshes, and scans as their authors release them.
+
+Of the scanned sets GSO and OmniObject3D the paper takes the 70 objects each that iFusion rendered, and 10 more of GSO
+that are not trained on; it publishes no lists. Where iFusion's renderings are at hand (`renderings`), the seen objects
+are those in there; else the choice is seeded. It is kept in `objects.json` beside the views.
+"""
 
 from __future__ import annotations
 
+import io
+import warnings
 from abc import abstractmethod
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import trimesh
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+from trimesh.resolvers import ZipResolver
 
-from lp_framework.data.meshes import MeshObject, load_scene
-from lp_framework.data.reading import names_below
+from lp_framework.data.meshes import MeshObject, load_scene, normalise
+from lp_framework.data.object_folders import ObjectLists, drawn, kept_lists
+from lp_framework.data.reading import expecting, names_below
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
-from lp_framework.data.sets.object_labels import Label, read_labels
-from lp_framework.data.sets.object_lists import ObjectLists, drawn, kept_lists
-from lp_framework.data.source import ViewSource
 from lp_framework.data.toy import toy_objects
-from lp_framework.data.views import ObjectViews, object_names
-from lp_framework.errors import UserError
+from lp_framework.data.views import ObjectViews, ViewSource, object_names
+from lp_framework.errors import UserError, nearest
 from lp_framework.registry import register
+
+# x, y, z of a world with +Z up become Z, X, Y, as `real_cameras.z_up_to_y_up` has it for cameras.
+_Z_UP_TO_Y_UP = np.eye(4)[[1, 2, 0, 3]]
+
+
+class Label(BaseModel):
+    """An object's ambiguity class and whether a view of it has one right longitude, None where the class decides."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    ambiguity: Literal["unique", "twofold", "continuous"]
+    unique_answer: bool | None = None
+    reason: str | None = None
+
+
+def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, Label]:
+    """The labels in a file, by object; `names` are the objects in the folder `where`.
+
+    Warns of objects that the file leaves out; they stay unlabelled. Raises `UserError` naming the file, and the object,
+    for a file that is missing or no YAML, for an object that is not in the folder and for a label that is none.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: there is no such file of labels") from None
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise UserError(f"{path}: is not readable YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: must give every object its label, as in 'mug: {{ambiguity: unique}}'")
+    labels = {}
+    for name, label in content.items():
+        if name not in names:
+            raise UserError(f"{path}: {where} has no object '{name}'{nearest(str(name), names)}")
+        try:
+            labels[name] = Label.model_validate(label)
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = "".join(f"{each}: " for each in first["loc"])
+            raise UserError(f"{path}: object '{name}': {key}{first['msg']}, got {first['input']!r}") from error
+    if left_out := sorted(set(names) - set(labels)):
+        warnings.warn(f"{path}: leaves out, so that they stay unlabelled: {', '.join(left_out)}", stacklevel=2)
+    return labels
 
 
 class RenderedData(ViewSource):
@@ -164,3 +216,86 @@ class MeshData(RenderedData):
     @cached_property
     def _labels(self) -> dict[str, Label]:
         return {} if self.labels is None else read_labels(self.labels, self._files, self.meshes)
+
+
+class ScannedData(MeshData):
+    """Objects of a download, rendered into `views`, by default `datasets/` and the name of the `release`."""
+
+    release: ClassVar[str]
+    what: ClassVar[str]  # there is in the download
+    layout: ClassVar[str]  # where the mesh of an object is, two folders below the one that has its name
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        path: str,
+        views: str | None = None,
+        renderings: str | None = None,
+        seen: int = 70,
+        unseen: int = 10,
+        objects: Literal["seen", "unseen"] = "seen",
+        split_seed: int = 0,
+        resolution: int = 512,
+        test_views: int = 8,
+        train_views: int | None = None,
+        latitude_step_degrees: float = 7.5,
+        longitude_step_degrees: float = 15.0,
+        depth: bool = False,
+        workers: int | None = None,
+    ) -> None:
+        super().__init__(
+            renderer, path, views or f"datasets/{self.release}", None, unseen, objects, split_seed, resolution,
+            test_views, train_views, latitude_step_degrees, longitude_step_degrees, depth, workers,
+        )  # fmt: skip
+        self.seen, self.renderings = seen, None if renderings is None else Path(renderings)
+
+    def file(self, name: str) -> Path:
+        """The mesh of an object."""
+        return self.meshes / self.layout.format(name=name, category=name.rpartition("_")[0])
+
+    @staticmethod
+    @abstractmethod
+    def load(path: Path) -> trimesh.Scene:
+        """An object's normalised scene, +Y up."""
+
+    def available(self) -> list[str]:
+        pattern = self.layout.format(name="*", category="*")
+        names = (file.parts[-3] for file in self.meshes.glob(pattern))
+        sound = (name for name in names if self.file(name).is_file())
+        return names_below(self.meshes, sound, self.what, self.meshes / pattern)
+
+    def object(self, name: str) -> MeshObject:
+        return MeshObject(name, "unlabelled", partial(self.load, self.file(name)))
+
+
+def load_gso(path: Path) -> trimesh.Scene:
+    """The normalised scene of an object of GSO, turned from +Z up to +Y up.
+
+    Raises `UserError` naming the file when the mesh or its texture is missing or does not load.
+    """
+    texture = path.parents[1] / "materials" / "textures" / "texture.png"
+    for file in (path, texture):
+        if not file.is_file():
+            raise UserError(f"{file}: there is no such file; an object of GSO needs it")
+    with expecting(f"{path}: does not load as a mesh"), path.open("rb") as opened:
+        # The material names its texture without the folder.
+        files = {file.name: io.BytesIO(file.read_bytes()) for file in (*path.parent.glob("*.mtl"), texture)}
+        scene = trimesh.load_scene(opened, file_type="obj", resolver=ZipResolver(files))
+        scene.apply_transform(_Z_UP_TO_Y_UP)
+        return normalise(scene)
+
+
+@register("data", "gso")
+class GSOData(ScannedData):
+    """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
+
+    release, what, layout = "gso", "objects of GSO", "{name}/meshes/model.obj"
+    load = staticmethod(load_gso)
+
+
+@register("data", "oo3d")
+class OO3DData(ScannedData):
+    """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
+
+    release, what, layout = "oo3d", "scans of OmniObject3D", "{category}/{name}/Scan/Scan.obj"
+    load = staticmethod(load_scene)  # has +Y up
