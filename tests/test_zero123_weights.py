@@ -431,7 +431,7 @@ def test_writing_is_all_or_nothing(networks, folder, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("lp_framework.priors.zero123.weights.save_file", full)
-    with pytest.raises(UserError, match="the disk is full"):
+    with pytest.raises(UserError, match="No space left on device"):
         write_folder(networks, tmp_path / "new")
     assert list(tmp_path.iterdir()) == []
 

@@ -33,12 +33,11 @@ LARGEST_TEXTURE = 2048  # pixels a side; finer detail than the views can show
 
 @dataclass(frozen=True)
 class MeshObject:
-    """One object of a data source.
+    """One object of a data source: its name, its ambiguity class, and what loads its normalised scene.
 
-    `load` returns its normalised scene; it must be a module-level function or a `functools.partial` of one, so that
-    worker processes can receive it. `ambiguity` is the object's ambiguity class. `unique_answer` says whether a view
-    has one right longitude: shapes without symmetry and two-fold ones, whose texture tells, have (the default), bodies
-    of revolution only with a texture that tells; None where nobody has looked.
+    `load` travels to worker processes: a module-level function or a `functools.partial` of one. `unique_answer` says
+    whether a view has one right longitude: shapes without symmetry and two-fold ones, whose texture tells, have (the
+    default), bodies of revolution only with a texture that tells; None where nobody has looked.
     """
 
     name: str
@@ -67,13 +66,12 @@ class Surface:
     texture_coordinates: NDArray[np.float32] | None  # [3T, 2], v upwards
 
 
-def load_scene(path: str | Path) -> trimesh.Scene:
+def load_scene(path: Path) -> trimesh.Scene:
     """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...).
 
     Warns once a file when part of it has neither texture nor colour; that part is drawn in a neutral grey.
     Raises `UserError` naming the file when it is missing, does not load, has no faces or has no extent.
     """
-    path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
     with expecting(f"{path}: does not load as a mesh"):

@@ -7,7 +7,6 @@ keeps which objects were chosen: a later run, with more of the data set download
 
 from __future__ import annotations
 
-import errno
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,9 +30,7 @@ def writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, SafetensorError) as error:
-        full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        reason = "the disk is full" if full else getattr(error, "strerror", error)
-        raise UserError(f"{folder}: cannot be written ({reason})") from error
+        raise UserError(f"{folder}: cannot be written ({getattr(error, 'strerror', error)})") from error
 
 
 @contextmanager
@@ -57,13 +54,6 @@ def written_folder(folder: Path) -> Iterator[Path]:
             partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def write_object(folder: Path, record_file: str, record: Mapping[str, Any], write: Callable[[Path], None]) -> None:
-    """Have an object's folder written by `write`, with its record, whole or not at all."""
-    with written_folder(folder) as partial:
-        write(partial)
-        (partial / record_file).write_text(json.dumps(record, indent=1))
 
 
 def read_record(file: Path) -> dict[str, Any]:

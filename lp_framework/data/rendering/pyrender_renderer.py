@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lp_framework.data.meshes import Surface, surfaces
 from lp_framework.data.rendering.raycast import RaycastRenderer
@@ -46,9 +46,9 @@ class PyrenderRenderer(Renderer):
         stage = pyrender.Scene(bg_color=[0, 0, 0, 0], ambient_light=[AMBIENT] * 3)
         stage.add(pyrender.Mesh(_primitives(surfaces(scene))))
         camera_node = stage.add(camera)
-        for light in LIGHTS:
-            source = pyrender.DirectionalLight(color=[1.0, 1.0, 1.0], intensity=light.intensity)
-            pose = trimesh.geometry.align_vectors([0, 0, 1], light.towards)  # its +Z points towards the light
+        for towards, intensity in LIGHTS:
+            source = pyrender.DirectionalLight(color=[1.0, 1.0, 1.0], intensity=intensity)
+            pose = trimesh.geometry.align_vectors([0, 0, 1], towards)  # its +Z points towards the light
             stage.add(source, pose=pose, parent_node=camera_node)
         for pose in np.asarray(camera_to_world, dtype=np.float64):
             stage.set_pose(camera_node, pose)
@@ -79,7 +79,7 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
                 continue
             attributes = [surface.positions[order], sign * surface.normals[order]]
             attributes += [each[order] for each in (coordinates, colours) if each is not None]
-            shared, index = _shared_corners(np.hstack(attributes))
+            shared, index = np.unique(np.hstack(attributes), axis=0, return_inverse=True)  # OpenGL transforms each once
             primitives.append(
                 pyrender.Primitive(
                     positions=shared[:, :3],
@@ -91,13 +91,6 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
                 )
             )
     return primitives
-
-
-def _shared_corners(corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The distinct rows, and the index of each row among them: OpenGL then transforms each only once."""
-    rows = np.ascontiguousarray(corners).view(np.dtype((np.void, corners.itemsize * corners.shape[1]))).reshape(-1)
-    _, first, index = np.unique(rows, return_index=True, return_inverse=True)
-    return corners[first], index
 
 
 @cache

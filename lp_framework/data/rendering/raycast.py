@@ -42,8 +42,10 @@ class RaycastRenderer(Renderer):
         for pose in np.asarray(camera_to_world, dtype=np.float64):
             samples, depth = np.zeros((side * side, 4), np.uint8), np.zeros(side * side, np.float32)
             for start in range(0, side * side, RAYS_AT_ONCE):
-                index = np.arange(start, min(start + RAYS_AT_ONCE, side * side))
-                rays = _directions(index, side, step, pose)
+                index = np.arange(start, min(start + RAYS_AT_ONCE, side * side))  # row by row, the first on top
+                row, column = np.divmod(index, side)
+                x, y = (column + 0.5 - side / 2) * step, (side / 2 - row - 0.5) * step
+                rays = x[:, None] * pose[:3, 0] + y[:, None] * pose[:3, 1] - pose[:3, 2]  # [n, 3], of depth 1
                 triangle = intersector.intersects_first(np.broadcast_to(pose[:3, 3], rays.shape), rays)
                 seen_from_behind = (normals[triangle] * rays).sum(axis=1) > 0
                 swapped = (triangle >= 0) & seen_from_behind & (twins[triangle] >= 0)
@@ -55,13 +57,6 @@ class RaycastRenderer(Renderer):
                         samples[index[met], :3] = colour * 255 + 0.5
                         samples[index[met], 3] = 255
             yield downsample(samples.reshape(side, side, 4), depth.reshape(side, side))
-
-
-def _directions(index: NDArray[np.int64], side: int, step: float, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World directions `[n, 3]`, of depth 1, through the samples with these row-major indices, first row on top."""
-    row, column = np.divmod(index, side)
-    x, y = (column + 0.5 - side / 2) * step, (side / 2 - row - 0.5) * step
-    return x[:, None] * pose[:3, 0] + y[:, None] * pose[:3, 1] - pose[:3, 2]
 
 
 class _Part:
@@ -130,8 +125,8 @@ def _shade(
     reflectance = np.float32(0.04)
     nv = np.clip(np.abs((normal * view).sum(axis=1)), 0.001, 1)
     out = AMBIENT * colour
-    for light in LIGHTS:
-        towards = (pose[:3, :3] @ np.array(light.towards) / np.linalg.norm(light.towards)).astype(np.float32)
+    for direction, intensity in LIGHTS:
+        towards = (pose[:3, :3] @ np.array(direction) / np.linalg.norm(direction)).astype(np.float32)
         half = _unit(view + towards)
         nl = np.clip(normal @ towards, 0.001, 1)
         vh = np.clip((view * half).sum(axis=1), 0, 1)
@@ -139,7 +134,7 @@ def _shade(
         occlusion = nv / (nv * 0.5 + 0.5) * nl / (nl * 0.5 + 0.5)
         specular = fresnel * occlusion / np.float32(np.pi) / (4 * nl * nv + 0.001)
         diffuse = ((1 - fresnel) * (1 - reflectance) / np.float32(np.pi))[:, None] * colour
-        out = out + (light.intensity * nl)[:, None] * (diffuse + specular[:, None])
+        out = out + (intensity * nl)[:, None] * (diffuse + specular[:, None])
     return out.astype(np.float32)
 
 

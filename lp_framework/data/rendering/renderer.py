@@ -17,14 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 SUPERSAMPLING = 2  # samples a pixel along each side
 
 
-class Light(NamedTuple):
-    """Parallel light: the vector towards it in the camera's frame (+X right, +Y up, +Z back), and its intensity."""
-
-    towards: tuple[float, float, float]
-    intensity: float
-
-
-LIGHTS = Light((-0.6, 0.8, 1.1), 2.5), Light((1.0, 0.1, 0.7), 0.65)  # from the upper left behind; from the right
+# Parallel lights: the vector towards one in the camera's frame (+X right, +Y up, +Z back), and its intensity.
+LIGHTS = ((-0.6, 0.8, 1.1), 2.5), ((1.0, 0.1, 0.7), 0.65)  # from the upper left behind; from the right
 AMBIENT = 0.2
 
 

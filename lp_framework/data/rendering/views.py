@@ -5,6 +5,7 @@ The layout is that of `data.views`, with one `render.json` an object that says h
 
 from __future__ import annotations
 
+import json
 import math
 import multiprocessing
 import os
@@ -25,7 +26,7 @@ from PIL import Image
 
 from lp_framework.data.cache import tracked
 from lp_framework.data.meshes import MeshObject, fingerprint
-from lp_framework.data.object_folders import differences, locked, raise_failures, read_record, write_object
+from lp_framework.data.object_folders import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, nerf_transforms, write_transforms
 from lp_framework.errors import UserError, check_settings
@@ -132,7 +133,7 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
     }
     splits = {"train": protocol.training_poses(obj.name), "test": protocol.test_poses(obj.name)}
 
-    def write(partial: Path) -> None:
+    with written_folder(folder) as partial:
         cameras = camera_to_world(torch.from_numpy(np.concatenate(list(splits.values()))))
         views = renderer.views(scene, cameras, protocol.resolution, protocol.field_of_view_degrees)
         for split, poses in splits.items():
@@ -153,8 +154,7 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
             if obj.ambiguity != "unlabelled":
                 transforms |= labels
             write_transforms(partial / split, **transforms)
-
-    write_object(folder, RECORD, record, write)
+        (partial / RECORD).write_text(json.dumps(record, indent=1))
 
 
 def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str | None:
@@ -185,8 +185,6 @@ def render_objects(
     """
     todo = list(objects)
     names = [obj.name for obj in todo]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise UserError(f"several objects have the same name: {', '.join(twice)}")
     if not check_meshes:
         todo = [obj for obj in todo if _changes(Path(root) / obj.name, protocol) != ""]
     if not todo:

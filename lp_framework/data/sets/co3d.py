@@ -32,7 +32,7 @@ from lp_framework.data.object_folders import drawn, kept_lists
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.reading import expecting, names_below, numbers, read_json
 from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes, from_pytorch3d, ndc_intrinsics
-from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData, checked
+from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
@@ -124,8 +124,8 @@ def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
         focal, principal = numbers(view["focal_length"], 2), numbers(view["principal_point"], 2)
         isotropic = FORMATS[view.get("intrinsics_format", "ndc_norm_image_bounds")]
         image, mask = root / frame["image"]["path"], root / frame["mask"]["path"]
-    camera, intrinsics = from_pytorch3d(rotation, translation), ndc_intrinsics(focal, principal, size, isotropic)
-    return checked(Photograph(image, mask, camera, intrinsics, size), where)
+        camera, intrinsics = from_pytorch3d(rotation, translation), ndc_intrinsics(focal, principal, size, isotropic)
+        return Photograph(image, mask, camera, intrinsics, size)
 
 
 def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | None, dict[str, float | None]]:

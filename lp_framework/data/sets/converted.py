@@ -11,6 +11,7 @@ Beside what every `transform.json` has, a frame keeps its photograph (`source`, 
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import warnings
@@ -28,7 +29,7 @@ from PIL import Image
 from torch import Tensor
 
 from lp_framework.data.cache import tracked
-from lp_framework.data.object_folders import LIST, differences, locked, raise_failures, read_record, write_object
+from lp_framework.data.object_folders import LIST, differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.real_cameras import (
     crop_field_of_view,
@@ -51,13 +52,22 @@ NEAREST = 1.0  # units of the object's longest side; a camera nearer than that i
 @dataclass(frozen=True)
 class Photograph:
     """A photograph of an object: its file, its mask's, its camera `[4, 4]` (camera to world, OpenGL axes, float64) in
-    the object's frame (see `real_cameras`), its intrinsics `[3, 3]` in pixels and its size (width, height)."""
+    the object's frame (see `real_cameras`), its intrinsics `[3, 3]` in pixels and its size (width, height).
+
+    Raises `ValueError` for a camera that can be none.
+    """
 
     file: Path
     mask: Path
     camera: Tensor
     intrinsics: Tensor
     size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        if not is_rotation(self.camera[:3, :3]):
+            raise ValueError("the rotation of its camera is not a rotation")
+        if not (self.intrinsics.diagonal()[:2] > 0).all():
+            raise ValueError("its focal lengths must be positive")
 
     def read(self, file: Path, mode: str) -> Image.Image:
         """The photograph or its mask; `UserError` where it cannot be read and where its size is another."""
@@ -66,16 +76,6 @@ class Photograph:
             (width, height), (wide, high) = image.size, self.size
             raise UserError(f"{file}: is {width} x {height} pixels, the photograph should be {wide} x {high}")
         return image
-
-
-def checked(photograph: Photograph, where: str) -> Photograph:
-    """The photograph; `UserError`, which begins with `where` its annotation is, for a camera that can be none."""
-    camera, intrinsics = photograph.camera, photograph.intrinsics
-    if not is_rotation(camera[:3, :3]):
-        raise UserError(f"{where}: the rotation of its camera is not a rotation")
-    if not (intrinsics.diagonal()[:2] > 0).all():
-        raise UserError(f"{where}: its focal lengths must be positive")
-    return photograph
 
 
 class Annotated(NamedTuple):
@@ -129,8 +129,9 @@ class ConvertedSource(ViewSource):
                 f"{folder}: holds other views than these settings make (see its {RECORD}); choose another data.views "
                 "or delete it"
             )
-        record = {"object": name, **self.demands()}
-        write_object(folder, RECORD, record, lambda partial: record.update(self.convert(name, partial)))
+        with written_folder(folder) as partial:
+            record = {"object": name, **self.demands(), **self.convert(name, partial)}
+            (partial / RECORD).write_text(json.dumps(record, indent=1))
 
 
 def is_converted(folder: Path, demands: Mapping[str, Any]) -> bool:

@@ -26,7 +26,7 @@ from lp_framework.data.object_folders import ObjectLists, kept_lists
 from lp_framework.data.photographs import opened
 from lp_framework.data.reading import expecting, numbers, read_json
 from lp_framework.data.real_cameras import ObjectFrame, z_up_to_y_up
-from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData, checked
+from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
 from lp_framework.geometry import from_opencv, inverse, rigid_transform
 from lp_framework.registry import register
@@ -123,17 +123,16 @@ def _frame(info: dict[str, Any]) -> ObjectFrame:
 
 def _photograph(instance: Instance, frame: ObjectFrame) -> Photograph:
     scene, image = instance.scene, instance.image
-    where = f"{scene}: image {image}"
-    with expecting(f"{where} needs cam_K of 9 numbers, cam_R_m2c of 9 and cam_t_m2c of 3"):
-        rotation, translation = instance.pose["cam_R_m2c"], instance.pose["cam_t_m2c"]
-        pose = rigid_transform(numbers(rotation, 9).view(3, 3), numbers(translation, 3))
-        intrinsics = numbers(instance.camera["cam_K"], 9).view(3, 3)
-    camera = frame.camera(from_opencv(inverse(pose)))
-    if (pose[:3, :3] @ frame.centre + pose[:3, 3])[2] <= 0:
-        raise UserError(f"{where} has an object behind its camera (cam_t_m2c)")
-    half = intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     files = [scene / "rgb" / f"{image:06d}{suffix}" for suffix in (".png", ".jpg")]
     file = next((file for file in files if file.is_file()), files[0])
     mask = scene / "mask_visib" / f"{image:06d}_{instance.place:06d}.png"
     with opened(file) as photograph:
-        return checked(Photograph(file, mask, camera, intrinsics + half, photograph.size), where)
+        size = photograph.size
+    with expecting(f"{scene}: image {image} needs cam_K of 9 numbers, cam_R_m2c of 9 and cam_t_m2c of 3"):
+        rotation, translation = instance.pose["cam_R_m2c"], instance.pose["cam_t_m2c"]
+        pose = rigid_transform(numbers(rotation, 9).view(3, 3), numbers(translation, 3))
+        intrinsics = numbers(instance.camera["cam_K"], 9).view(3, 3)
+        if (pose[:3, :3] @ frame.centre + pose[:3, 3])[2] <= 0:
+            raise ValueError("the object is behind its camera")
+        half = intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        return Photograph(file, mask, frame.camera(from_opencv(inverse(pose))), intrinsics + half, size)

@@ -37,7 +37,7 @@ _Z_UP_TO_Y_UP = np.eye(4)[[1, 2, 0, 3]]
 
 
 class Label(BaseModel):
-    """An object's ambiguity class and whether a view of it has one right longitude, None where the class decides."""
+    """An object's ambiguity class and whether a view of it has one right longitude (None: as `MeshObject` has it)."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -47,17 +47,16 @@ class Label(BaseModel):
 
 
 def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, Label]:
-    """The labels in a file, by object; `names` are the objects in the folder `where`.
+    """The labels in a YAML file, by object; `names` are the objects in the folder `where`.
+
+        bbq_sauce: {ambiguity: continuous, unique_answer: true, reason: "a bottle; its label is on one side"}
+        butter: {ambiguity: twofold, reason: "a box that says something else on each side"}
 
     Warns of objects that the file leaves out; they stay unlabelled. Raises `UserError` naming the file, and the object,
     for a file that is missing or no YAML, for an object that is not in the folder and for a label that is none.
     """
-    try:
+    with expecting(f"{path}: is not readable YAML"):
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: there is no such file of labels") from None
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: is not readable YAML ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
         raise UserError(f"{path}: must give every object its label, as in 'mug: {{ambiguity: unique}}'")
     labels = {}
@@ -140,9 +139,10 @@ class MeshData(RenderedData):
     """A folder of meshes, in any formats that trimesh reads; rendered into `views`.
 
     `unseen` of its objects are kept from training; `objects` says whether these or the others are in use. `labels` is
-    a YAML file with their ambiguity classes (see `object_labels`).
+    a YAML file with their ambiguity classes (see `read_labels`).
     """
 
+    load = staticmethod(load_scene)
     seen: int | None = None  # how many there are to train on, all but the unseen ones by default
     renderings: Path | None = None  # a folder of views of those to train on, which are drawn by default
 
@@ -172,12 +172,12 @@ class MeshData(RenderedData):
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:
-        """The objects in use, sorted by name (see `object_lists`)."""
+        """The objects in use, sorted by name (see `kept_lists`)."""
         if self.seen is None and not self.unseen and self.which == "seen":
-            return [self.object(name) for name in self.available()]
+            return [self._object(name) for name in self.available()]
         how = {key: getattr(self, key) for key in ("seen", "unseen", "split_seed")}
         how["renderings"] = None if self.renderings is None else self.renderings.name
-        return [self.object(name) for name in kept_lists(self.path, how, self._choose).named(self.which)]
+        return [self._object(name) for name in kept_lists(self.path, how, self._choose).named(self.which)]
 
     def _choose(self) -> ObjectLists:
         available = self.available()
@@ -195,12 +195,15 @@ class MeshData(RenderedData):
         """Names of the objects in the folder; `UserError`, with the files looked for, where there are none."""
         return list(self._files)
 
-    def object(self, name: str) -> MeshObject:
-        """The object of a name."""
-        load = partial(load_scene, self._files.get(name, self.meshes / name))
-        if label := self._labels.get(name):
-            return MeshObject(name, label.ambiguity, load, label.unique_answer)
-        return MeshObject(name, "unlabelled", load)
+    def file(self, name: str) -> Path:
+        """The mesh of an object."""
+        return self._files.get(name, self.meshes / name)
+
+    def _object(self, name: str) -> MeshObject:
+        load, label = partial(self.load, self.file(name)), self._labels.get(name)
+        if label is None:
+            return MeshObject(name, "unlabelled", load)
+        return MeshObject(name, label.ambiguity, load, label.unique_answer)
 
     @cached_property
     def _files(self) -> dict[str, Path]:
@@ -250,22 +253,13 @@ class ScannedData(MeshData):
         self.seen, self.renderings = seen, None if renderings is None else Path(renderings)
 
     def file(self, name: str) -> Path:
-        """The mesh of an object."""
         return self.meshes / self.layout.format(name=name, category=name.rpartition("_")[0])
-
-    @staticmethod
-    @abstractmethod
-    def load(path: Path) -> trimesh.Scene:
-        """An object's normalised scene, +Y up."""
 
     def available(self) -> list[str]:
         pattern = self.layout.format(name="*", category="*")
         names = (file.parts[-3] for file in self.meshes.glob(pattern))
         sound = (name for name in names if self.file(name).is_file())
         return names_below(self.meshes, sound, self.what, self.meshes / pattern)
-
-    def object(self, name: str) -> MeshObject:
-        return MeshObject(name, "unlabelled", partial(self.load, self.file(name)))
 
 
 def load_gso(path: Path) -> trimesh.Scene:
@@ -298,4 +292,3 @@ class OO3DData(ScannedData):
     """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
 
     release, what, layout = "oo3d", "scans of OmniObject3D", "{category}/{name}/Scan/Scan.obj"
-    load = staticmethod(load_scene)  # has +Y up
