@@ -105,7 +105,7 @@ def test_a_cloud_of_something_else_does_not_agree_with_the_silhouettes(seen_came
     points = box_points()
     for others in (points + 0.5 * SCALE, (points - ORIGIN) * 2 + ORIGIN, (points - ORIGIN) / 2 + ORIGIN):
         assert not frame_of_points(cameras, others).agrees(silhouettes)
-    with pytest.raises(UserError, match="its point cloud has no extent"):
+    with pytest.raises(ValueError, match="its point cloud has no extent"):
         frame_of_points(cameras, points[:1].expand(9, 3))
 
 
@@ -113,7 +113,7 @@ def test_cameras_on_a_vertical_arc_do_not_tell_up(tmp_path):
     latitudes = torch.linspace(-0.5, 0.5, 6, dtype=torch.float64)
     cameras = camera_to_world(torch.stack([latitudes, torch.ones(6).double(), 3 * torch.ones(6).double()], dim=-1))
     outline = np.array([[90.0, 90.0], [110.0, 110.0], [90.0, 110.0]])
-    with pytest.raises(UserError, match="do not go round the object"):
+    with pytest.raises(ValueError, match="do not go round the object"):
         frame_of_silhouettes(cameras, orbit(1)[0][1].expand(6, 3, 3), [outline] * 6)
 
 

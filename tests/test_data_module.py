@@ -450,11 +450,11 @@ def test_meshes_are_rendered_on_first_use_only_and_then_not_even_loaded(mesh_dat
 
 
 def test_the_render_command_sees_another_mesh_under_the_name(mesh_data, meshes):
-    mesh_data().render()
-    mesh_data().render()
+    mesh_data().prepare(check_meshes=True)
+    mesh_data().prepare(check_meshes=True)
     (meshes / "brick.ply").replace(meshes / "cube.ply")
     with pytest.raises(UserError, match=r"cube was rendered differently \(mesh was"):
-        mesh_data().render()
+        mesh_data().prepare(check_meshes=True)
 
 
 def test_another_protocol_is_seen_in_any_case(mesh_data):
@@ -498,7 +498,7 @@ def test_labels_of_a_file_hold_for_views_that_are_there_already_and_change_nothi
     assert labels_of(data) == labels_of(data, "train") == {"brick": ("twofold", True), "cube": ("unique", True)}
     file.write_text("brick: {ambiguity: continuous}\ncube: {ambiguity: continuous, unique_answer: true}\n")
     data = mesh_data(labels=str(file))
-    data.render()
+    data.prepare(check_meshes=True)
     assert labels_of(data) == {"brick": ("continuous", False), "cube": ("continuous", True)}
     assert labels_of(mesh_data()) == {"brick": ("unlabelled", None), "cube": ("unlabelled", None)}
     assert {path: path.read_bytes() for path in (tmp_path / "rendered").rglob("*.*") if path.is_file()} == before

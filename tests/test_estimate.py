@@ -193,7 +193,7 @@ def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path)
     [
         ([], "images needs a value: give images=VALUE"),
         (["images=photos/front.png"], "photos/front.png: is one image, two or more are needed"),
-        (["images=[photos/front.png,photos/none.png]"], "photos/none.png: there is no such image"),
+        (["images=[photos/front.png,photos/none.png]"], "photos/none.png: there is no such file"),
         (["images=[photos/front.png,photos/broken.png]"], "photos/broken.png: is not a readable image"),
         (["images=photos", "masks=none"], "masks=none: there is no such folder"),
         (["images=photos", "crop=perhaps"], "crop must be true or false, got perhaps"),
@@ -280,7 +280,7 @@ def test_mistakes_name_the_picture():
     recorder, image = Recorder(), placed(drawn(), 30, 20)
     for query, error in (
         (image.convert("RGB"), "query: has no transparent background"),
-        ("none.png", r"none\.png: there is no such image"),
+        ("none.png", r"none\.png: there is no such file"),
         (np.zeros((4, 4)), r"query must be \[H, W, 3\] or"),
         (Image.fromarray(np.zeros((4, 4), dtype=np.float32)), "query: its pixels are floating-point numbers"),
     ):

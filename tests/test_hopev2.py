@@ -170,9 +170,9 @@ def entry(key: str, value):
             lambda root: rewrite(scene(root, "scene_camera.json"), lambda c: c["0"].update(cam_K=[0.0] * 9)),
             "focal lengths must be positive",
         ),
-        (lambda root: scene(root, "rgb/000000.png").unlink(), r"rgb/000000\.png: there is no such image"),
+        (lambda root: scene(root, "rgb/000000.png").unlink(), r"rgb/000000\.png: there is no such file"),
         (lambda root: scene(root, "rgb/000000.png").write_bytes(b"no"), r"rgb/000000\.png: is not a readable image"),
-        (lambda root: scene(root, "mask_visib/000000_000001.png").unlink(), "000001.png: there is no such image"),
+        (lambda root: scene(root, "mask_visib/000000_000001.png").unlink(), "000001.png: there is no such file"),
         (
             lambda root: Image.new("L", (80, 60), 255).save(scene(root, "mask_visib/000000_000001.png")),
             r"000000_000001\.png: is 80 x 60 pixels, the photograph should be 320 x 240",
@@ -206,7 +206,7 @@ def test_objects_that_cannot_be_converted_are_listed_and_the_others_are_ready(ma
     (root / "val" / "000007" / "rgb" / "000003.png").unlink()
     lines = (
         r"2 of 3 objects could not be converted; mend them, or take their names out of .*views/objects\.json:\n"
-        r"  obj_000003: .*has 0 usable views.*\n  obj_000004: .*000003\.png: there is no such image"
+        r"  obj_000003: .*has 0 usable views.*\n  obj_000004: .*000003\.png: there is no such file"
     )
     for _ in range(2):
         with pytest.raises(UserError, match=lines):

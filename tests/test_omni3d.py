@@ -11,7 +11,7 @@ from view_folders import write_object
 
 from lp_framework import registry
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.sets.omni3d import Omni3DData, omni3d_cameras, omni3d_objects
+from lp_framework.data.sets.omni3d import Omni3DData, omni3d_cameras
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, relative_pose, view_pose
@@ -139,7 +139,7 @@ def alone(root: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (no_image, r"images/001\.png: there is no such image"),
+        (no_image, r"images/001\.png: there is no such file"),
         (opaque, r"images/001\.png: has no transparent background"),
         (oblong, r"images/001\.png: is 20 x 30 pixels; views must be square"),
         (cut_short, r"poses/001\.npy: must be a 4 x 4 camera-to-world matrix"),
@@ -179,9 +179,9 @@ def test_there_is_nothing_to_train_on(data):
 
 def test_wrong_roots(root, tmp_path):
     with pytest.raises(UserError, match=r"nowhere: there is no such folder"):
-        omni3d_objects(tmp_path / "nowhere")
+        Omni3DData(tmp_path / "nowhere").names()
     with pytest.raises(UserError, match=r"looked for .*OBJECT/poses/\*\.npy"):
-        omni3d_objects(root / "dinosaur_002")
+        Omni3DData(root / "dinosaur_002").names()
 
 
 # ---------------------------------------------------------------- ID-Pose's results
@@ -222,7 +222,7 @@ def test_errors_are_in_degrees_and_in_units_where_the_reference_stands_at_185(ro
 
 def test_results_are_relative_poses(root, tmp_path):
     write_results(tmp_path / "outputs", (0.0, 0.0, 0.0))
-    found = read_idpose_results(tmp_path / "outputs", omni3d_objects(root))
+    found = read_idpose_results(tmp_path / "outputs", Omni3DData(root).names())
     assert [pair[:3] for pair in found] == [("dinosaur_002", "011", "001"), ("dinosaur_002", "011", "077")]
     cameras = omni3d_cameras(root, "dinosaur_002")
     poses = {view: view_pose(camera) for view, camera in cameras.items()}
@@ -274,11 +274,11 @@ def test_the_published_results_with_zero123_xl(published, capsys):
     assert metrics["rotation_error"] == pytest.approx(5.903, abs=1e-3)
     assert metrics["translation_error"] == pytest.approx(0.2071, abs=1e-4)
     # The file has its own account of the truth.
-    found = read_idpose_results(published, omni3d_objects(published))
+    found = read_idpose_results(published, Omni3DData(published).names())
     for file in published.glob("*.json"):
         for view, entry in json.loads(file.read_text())["obs"].items():
             if "gt_rel_sph" in entry:
-                name = next(name for name in omni3d_objects(published) if name in file.name)
+                name = next(name for name in Omni3DData(published).names() if name in file.name)
                 cameras = omni3d_cameras(published, name)
                 (pair,) = [each for each in found if (each.object, each.query) == (name, view)]
                 truth = relative_pose(view_pose(cameras[pair.reference]), view_pose(cameras[view]))

@@ -456,7 +456,7 @@ def test_finished_objects_are_believed_without_their_meshes_where_that_is_asked_
 def test_a_folder_without_its_record_is_not_believed(tmp_path, damage):
     render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
     damage(tmp_path / "cube")
-    with pytest.raises(UserError, match="cube exists and was not rendered by this program"):
+    with pytest.raises(UserError, match=r"cube was rendered differently \(it has no proper render\.json\)"):
         render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
 
 
@@ -509,7 +509,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     (tmp_path / "cube").mkdir()
     (tmp_path / "cube" / "thesis.txt").write_text("precious")
-    with pytest.raises(UserError, match="cube exists and was not rendered by this program"):
+    with pytest.raises(UserError, match=r"cube was rendered differently \(it has no proper render\.json\)"):
         render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer())
     assert contents(tmp_path) == {"cube/thesis.txt": b"precious"}
 

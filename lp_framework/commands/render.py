@@ -16,5 +16,5 @@ def run(config: DictConfig) -> None:
     if not isinstance(source, RenderedData):
         choices = [name for name in registry.names("data") if issubclass(registry.get("data", name), RenderedData)]
         raise UserError(f"data={config.data.name} has no meshes to render; choose one of {', '.join(choices)}")
-    source.render()
+    source.prepare(check_meshes=True)
     print(f"views: {source.path}")

@@ -29,10 +29,8 @@ T = TypeVar("T")
 
 
 def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], Iterable[NDArray]]) -> NDArray:
-    """The array `[count, ...]` of a key, read-only and memory-mapped.
-
-    Where it is missing or damaged, it is put together from `blocks`, which are `[n, ...]` of any one shape and type.
-    """
+    """The array `[count, ...]` of a key, read-only and memory-mapped; where it is missing or damaged, it is made
+    from `blocks`, which are `[n, ...]` of any one shape and type."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -67,9 +67,8 @@ class Surface:
 
 
 def load_scene(path: Path) -> trimesh.Scene:
-    """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...).
+    """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...); warns where part of it has no colour.
 
-    Warns once a file when part of it has neither texture nor colour; that part is drawn in a neutral grey.
     Raises `UserError` naming the file when it is missing, does not load, has no faces or has no extent.
     """
     if not path.is_file():
@@ -85,11 +84,8 @@ def load_scene(path: Path) -> trimesh.Scene:
 
 
 def normalise(scene: trimesh.Scene) -> trimesh.Scene:
-    """A copy with the bounding box centred at the origin and its longest side 1, all transforms applied.
-
-    What is not a mesh with faces (points, paths) is left out. Raises `ValueError` when no faces, no extent or no
-    area remain.
-    """
+    """A copy with the bounding box centred at the origin and its longest side 1, all transforms applied, without points
+    and paths. Raises `ValueError` when no faces, no extent or no area remain."""
     meshes = _meshes(scene)
     if not meshes:
         raise ValueError("it has no faces")
@@ -164,10 +160,7 @@ def _weld(points: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _twins(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each of the distinct triangles `[T, 3]` the index of the one with the same points in the other order, or -1.
-
-    Modellers that paint the two sides of a sheet differently write it as such a pair.
-    """
+    """For each of distinct triangles `[T, 3]` the index of the one with the same points in the other order, or -1."""
     turned = triangles[:, [0, 2, 1]]
     group = np.unique(np.concatenate([triangles, turned]), axis=0, return_inverse=True)[1].reshape(-1)
     owner = np.full(group.max() + 1, -1)

@@ -82,8 +82,6 @@ class PairDataModule(LightningDataModule):
         self._tables: dict[str, ViewTable] = {}
         self._image_keys: dict[str, str] = {}
 
-    # ------------------------------------------------------------ what there is
-
     def prepare_data(self) -> None:
         """Make what is missing on disk, in one process: views, decoded views, cached features."""
         self.source.prepare()
@@ -136,8 +134,6 @@ class PairDataModule(LightningDataModule):
         files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
         return replace(views, files=files, cameras=cameras)
 
-    # ------------------------------------------------------------ what is asked for
-
     def evaluate_on(self, protocol: str, seed: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
         """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
         self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), None, batch_pairs
@@ -170,8 +166,6 @@ class PairDataModule(LightningDataModule):
     def carry(self, *what: Literal["alpha", "depth"]) -> None:
         """From now on batches carry the views' alpha channels, or the depths that were rendered with them, as well."""
         self._carried = {*what}
-
-    # ------------------------------------------------------------ batches
 
     def data(self, split: str) -> PairData:
         """The batches of a split, addressed by pairs."""

@@ -92,36 +92,25 @@ class ObjectLists(NamedTuple):
     seen: list[str]
     unseen: list[str]
 
-    def named(self, which: str) -> list[str]:
-        """The list called "seen" or "unseen"; `UserError` where it is empty."""
-        names = self.unseen if which == "unseen" else self.seen
-        if not names:
-            raise UserError(f"data.objects={which}: there are none; set data.unseen to the number of unseen objects")
-        return names
-
 
 def drawn(available: Sequence[str], seen: int | None, unseen: int, seed: int, where: Path) -> ObjectLists:
-    """A seeded choice of `seen` (None: all others) and `unseen` objects among those available.
-
-    Raises `UserError`, naming the place, where there are too few.
-    """
+    """A seeded choice of `seen` (None: all other) and `unseen` objects; `UserError` naming the place for too few."""
     names = sorted(available)
-    least = (1 if seen is None else seen) + unseen
-    if min(unseen, least - unseen) < 0 or least == 0:
+    if seen is None:
+        seen = max(len(names) - unseen, 1)
+    needed = seen + unseen
+    if min(seen, unseen) < 0 or needed == 0:
         raise UserError(f"{where}: the numbers of objects must not be negative, got {seen} seen and {unseen} unseen")
-    if len(names) < least:
-        raise UserError(
-            f"{where}: {len(names)} objects are there, {least} are needed ({least - unseen} seen and {unseen} unseen)"
-        )
+    if len(names) < needed:
+        wanted = f"{needed} are needed ({seen} seen and {unseen} unseen)"
+        raise UserError(f"{where}: {len(names)} objects are there, {wanted}")
     order = [names[index] for index in np.random.default_rng(seed).permutation(len(names))]
-    return ObjectLists(sorted(order[unseen:] if seen is None else order[unseen:least]), sorted(order[:unseen]))
+    return ObjectLists(sorted(order[unseen:needed]), sorted(order[:unseen]))
 
 
 def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectLists]) -> ObjectLists:
-    """The lists in the folder `views`, chosen and written there where there are none yet.
-
-    `how` (plain values) says how they are chosen; `UserError` where those that are there were chosen otherwise.
-    """
+    """The lists in the folder `views`, chosen and written there where there are none yet; `UserError` where those that
+    are there were chosen otherwise than `how` (plain values) says."""
     path = views / LIST
     if not path.exists():
         lists = choose()

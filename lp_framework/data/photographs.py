@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageOps
 
 from lp_framework.atomic import written
+from lp_framework.data.reading import expecting
 from lp_framework.errors import UserError
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
@@ -70,15 +71,8 @@ def _images_in(folder: Path) -> list[Path]:
 @contextmanager
 def opened(file: str | Path) -> Iterator[Image.Image]:
     """An image file, of which only the head has been read; `UserError` naming the file where it cannot be read."""
-    try:
-        with Image.open(file) as image:
-            yield image
-    except UserError:
-        raise
-    except FileNotFoundError:
-        raise UserError(f"{file}: there is no such image") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UserError(f"{file}: is not a readable image ({error})") from error
+    with expecting(f"{file}: is not a readable image"), Image.open(file) as image:
+        yield image
 
 
 def read_image(file: str | Path) -> Image.Image:
@@ -115,10 +109,7 @@ def array_image(array: ArrayLike, name: str) -> Image.Image:
 
 @cache
 def _background_remover() -> Callable[[Image.Image], Image.Image]:
-    """The opacity ("L") of what is in an image, by rembg (MIT licence) with the network U^2-Net (Apache-2.0).
-
-    rembg downloads the weights (176 MB) unless it has done so before.
-    """
+    """The opacity ("L") of what is in an image, by rembg (MIT licence) with U^2-Net (Apache-2.0, 176 MB)."""
     try:
         from rembg import new_session, remove
     except (ImportError, SystemExit):  # without onnxruntime it exits
@@ -170,25 +161,19 @@ def cut_out(
 
 
 def _opacity(levels: Image.Image) -> Image.Image | None:
-    """The opacity that an alpha channel or mask ("L") stands for; None where nothing is less than half opaque.
-
-    The least level is background: ID-Pose's cut-outs have 127 there. Of just two levels the other one is opaque, as in
-    masks of zeros and ones.
-    """
+    """The opacity that an alpha channel or mask ("L") stands for; None where nothing is less than half opaque."""
     values = np.asarray(levels)
     low, high = int(values.min()), int(values.max())
     if low >= HALF:
         return None
+    # The least level is background, 127 in ID-Pose's cut-outs; of just two the other one is opaque, be it 1.
     top = high if low < high and ((values == low) | (values == high)).all() else 255
     stretched = (values.astype(np.float32) - low) * (255 / (top - low))
     return Image.fromarray(np.rint(stretched).astype(np.uint8))
 
 
 def crop_to_object(image: Image.Image, name: str) -> Image.Image:
-    """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module).
-
-    What lies beyond the photograph is transparent.
-    """
+    """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module)."""
     box = image.getchannel("A").point([0] * HALF + [255] * (256 - HALF)).getbbox()
     if box is None:
         raise UserError(f"{name}: its mask is empty, nothing in it is at least half opaque")
@@ -210,10 +195,8 @@ def prepare(
     remove_background: bool = False,
     crop: bool = True,
 ) -> Image.Image:
-    """A photograph prepared, RGBA of `SIZE` pixels a side; see `cut_out` and `crop_to_object`.
-
-    Without `crop` the whole image is kept, which must be square; one without background then shows the object on white.
-    """
+    """RGBA of `SIZE` pixels a side: by `cut_out` and `crop_to_object`, or, without `crop`, the whole image, which must
+    be square; one without background then shows the object on white."""
     if crop:
         return crop_to_object(cut_out(image, name, mask, remove_background), name)
     if image.width != image.height:
@@ -225,10 +208,7 @@ def prepare(
 def prepared_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
 ) -> list[Image.Image]:
-    """Image files as `prepare` has them, with their masks from the folder `masks`, if one is given.
-
-    All are read before the first is prepared, so that what is wrong with any file shows before anything takes long.
-    """
+    """Image files as `prepare` has them, with their masks from the folder `masks`; all are read before that begins."""
     for name, value in (("remove_background", remove_background), ("crop", crop)):
         if not isinstance(value, bool):
             raise UserError(f"{name} must be true or false, got {value}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,14 +20,10 @@ LARGEST_RESIDUAL = 1.0  # degrees; a camera further from a spherical one is refu
 
 def read_json(file: Path) -> Any:
     """The content of a JSON file, of a gzipped one (.jgz) too."""
-    form = "gzipped JSON" if file.suffix == ".jgz" else "JSON"
-    try:
+    zipped = file.suffix == ".jgz"
+    with expecting(f"{file}: is not readable {'gzipped ' if zipped else ''}JSON"):
         content = file.read_bytes()
-        return json.loads(gzip.decompress(content) if file.suffix == ".jgz" else content)
-    except FileNotFoundError:
-        raise UserError(f"{file}: there is no such file, which is needed") from None
-    except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
-        raise UserError(f"{file}: is not readable {form} ({error})") from error
+        return json.loads(gzip.decompress(content) if zipped else content)
 
 
 @contextmanager
@@ -38,6 +33,8 @@ def expecting(sentence: str) -> Iterator[None]:
         yield
     except UserError:
         raise
+    except FileNotFoundError as error:
+        raise UserError(f"{error.filename}: there is no such file") from error
     except Exception as error:  # parsers raise anything from KeyError to struct.error
         reason = " ".join(str(error).split())
         raise UserError(f"{sentence} ({type(error).__name__}: {reason})") from error

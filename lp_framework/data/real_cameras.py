@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
-from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, geodesic_angle, inverse, rigid_transform, view_pose
 
 NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
@@ -112,10 +111,8 @@ def crop_field_of_view(distance: Tensor, radius: Tensor) -> Tensor:
 
 
 def crop_homography(camera: Tensor, intrinsics: Tensor, radius: Tensor, size: int) -> Tensor:
-    """Homography `[..., 3, 3]` that takes points of the crop, in pixels of `size` a side, to those of the photograph.
-
-    `camera` `[..., 4, 4]` and `intrinsics` `[..., 3, 3]` are the photograph's, `radius` `[...]` is the effective one.
-    """
+    """Homography `[..., 3, 3]` that takes points of the crop, in pixels of `size` a side, to those of the photograph of
+    this `camera` `[..., 4, 4]` and `intrinsics` `[..., 3, 3]`; `radius` `[...]` is the effective one."""
     turned, _ = turn_towards_centre(camera)
     half = torch.tan(crop_field_of_view(camera[..., :3, 3].norm(dim=-1), radius) / 2)
     # From a pixel of the crop to its ray: half the crop's side is the tangent of half its field of view.
@@ -142,10 +139,7 @@ def project(camera: Tensor, intrinsics: Tensor, points: Tensor) -> Tensor:
 
 def perspective_residual(camera: Tensor, radius: Tensor, points: Tensor) -> Tensor:
     """How far points `[P, 3]` of the object lie in the crop from where the spherical camera that it stands for has
-    them: root mean square `[...]`, in units of the image's side; infinite where the photograph's camera is among them.
-
-    0 where the effective radius is the distance.
-    """
+    them: root mean square `[...]`, in units of the image's side; infinite where its camera is among them."""
     turned, _ = turn_towards_centre(camera)
     distance = camera[..., :3, 3].norm(dim=-1)
     crop, virtual = (
@@ -193,7 +187,7 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
 
     The centre is the point nearest to the lines of sight through the middles of the silhouettes. The height is the
     median of the silhouettes' heights, both widths are nearly the largest of theirs (a 90 % quantile), all at the
-    centre's distance. Raises `UserError` where the cameras do not go round the object.
+    centre's distance. Raises `ValueError` where the cameras do not go round the object.
     """
     axes = _axes(cameras)
     rays = [_rays(*each) for each in zip(axes @ cameras[:, :3, :3], intrinsics, pixels, strict=True)]
@@ -208,7 +202,7 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
     across, high = ((extents[:, 1] - extents[:, 0]) * distances).unbind(-1)
     sides = torch.stack([across.quantile(0.9), high.median(), across.quantile(0.9)])
     if not sides.max() > 0:
-        raise UserError("its cameras stand in the object's centre")
+        raise ValueError("its cameras stand in the object's centre")
     return ObjectFrame(axes, centre @ axes, sides.max(), sides / sides.max())
 
 
@@ -216,7 +210,7 @@ def frame_of_points(cameras: Tensor, points: Tensor) -> ObjectFrame:
     """The frame of an object from cameras `[V, 4, 4]` around it and points `[P, 3]` on its surface.
 
     Its box stands upright, is turned to where it covers the least ground, and leaves out `STRAY` of the points on
-    each side. Raises `UserError` where the cameras do not go round the object and where the points have no extent.
+    each side. Raises `ValueError` where the cameras do not go round the object and where the points have no extent.
     """
     axes = _axes(cameras)
     points = points[torch.linspace(0, len(points) - 1, min(len(points), POINTS)).round().long()]
@@ -226,7 +220,7 @@ def frame_of_points(cameras: Tensor, points: Tensor) -> ObjectFrame:
     best = int((sides[:, 0] * sides[:, 2]).argmin())
     longest = sides[best].max()
     if not (longest.isfinite() and longest > 0):
-        raise UserError("its point cloud has no extent")
+        raise ValueError("its point cloud has no extent")
     return ObjectFrame(turns[best], boxes[best].mean(dim=0) @ turns[best], longest, sides[best] / longest)
 
 
@@ -236,7 +230,7 @@ def _axes(cameras: Tensor) -> Tensor:
     spread, directions = torch.linalg.eigh(right.mT @ right / len(right))
     axis = directions[:, 0]
     if spread[1] < 0.02:
-        raise UserError("its cameras do not go round the object, so which way is up cannot be told")
+        raise ValueError("its cameras do not go round the object, so which way is up cannot be told")
     axis = axis * torch.where((up @ axis).mean() < 0, -1.0, 1.0)
     first = torch.linalg.cross(axis, torch.eye(3, dtype=axis.dtype)[axis.abs().argmin()])
     first = first / first.norm()

@@ -37,17 +37,14 @@ DEPTH_UNIT = 1e-4  # scene units a level of a depth image
 
 @dataclass(frozen=True)
 class ObjectViews:
-    """The views of one object in one split: V image files and cameras `[V, 4, 4]` (camera to world, float64).
-
-    `unique_answer`: whether a view has one right longitude, None where unknown.
-    """
+    """The V views of one object in one split; `unique_answer`: whether one has one right longitude, None: unknown."""
 
     name: str
     split: str
     ambiguity: str
     unique_answer: bool | None
     files: list[Path]
-    cameras: Tensor = field(repr=False)
+    cameras: Tensor = field(repr=False)  # [V, 4, 4], camera to world, float64
     field_of_view: float  # radians
 
     def __len__(self) -> int:
@@ -89,19 +86,15 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
         raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {field_of_view}")
     files, cameras = [], []
     for index, (file_path, matrix) in enumerate(frames):
-        files.append(_image_file(path, file_path))
+        places = [folder / file_path for folder in (path.parent / "rgb", path.parent)]
+        files += [place for place in places if os.path.isfile(place)][:1]  # Path.is_file fails for an impossible name
+        if len(files) == index:
+            raise UserError(f"{path}: the image {file_path!r} is neither in rgb/ nor beside this file")
         with expecting(f"{path}: transform_matrix of frame {index} is not a 4 x 4 matrix of finite numbers"):
             camera = numbers(matrix, 4, 4)
         check_upright(camera, f"{path}: the camera of frame {index}")
         cameras.append(camera)
     return ObjectViews(name, split, ambiguity, unique_answer, files, torch.stack(cameras), field_of_view)
-
-
-def _image_file(transforms: Path, file_path: str) -> Path:
-    for folder in (transforms.parent / "rgb", transforms.parent):
-        if os.path.isfile(folder / file_path):  # unlike Path.is_file, False for an impossible name
-            return folder / file_path
-    raise UserError(f"{transforms}: the image {file_path!r} is neither in rgb/ nor beside this file")
 
 
 def write_transforms(folder: Path, frames: list[dict[str, Any]], **more: Any) -> None:

@@ -20,7 +20,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from lp_framework.data.sets.omni3d import RADIUS, omni3d_cameras, omni3d_objects
+from lp_framework.data.sets.omni3d import RADIUS, Omni3DData, omni3d_cameras
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch
 from lp_framework.evaluation.tables import summary_rows, terminal_table
@@ -66,7 +66,7 @@ def _pairs(file: Path, objects: Sequence[str]) -> list[IDPosePair]:
 
 def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
     """Metrics as `PoseMetrics.compute` gives them, over all pairs, in units where the reference stands at 1.85."""
-    names = omni3d_objects(views)
+    names = Omni3DData(str(views)).names()
     pairs = read_idpose_results(results, names)
     cameras = {name: omni3d_cameras(views, name) for name in {pair.object for pair in pairs}}
     for name, *both, _ in pairs:

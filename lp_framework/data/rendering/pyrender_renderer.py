@@ -1,7 +1,7 @@
 """`renderer=pyrender`: OpenGL without a display, by EGL or OSMesa; and `renderer=auto`, which falls back on raycast.
 
-pyrender's shader has a physically based material; with metalness 0 and roughness 1 it comes to a Lambertian surface
-with a faint sheen. It decodes textures from sRGB and multiplies vertex colours, taken as linear, onto the lit result.
+pyrender's shader decodes textures from sRGB and multiplies vertex colours, taken as linear, onto the lit result. With
+metalness 0 and roughness 1 its material comes to a Lambertian surface with a faint sheen.
 """
 
 from __future__ import annotations
@@ -57,10 +57,8 @@ class PyrenderRenderer(Renderer):
 
 
 def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
-    """Every triangle twice, the second time turned over with its normals; culling then leaves the side in view.
-
-    A triangle that another one backs has its other side there already.
-    """
+    """Every triangle twice, the second time turned over with its normals, unless another one backs it; culling then
+    leaves the side in view."""
     import pyrender
 
     primitives = []
@@ -95,10 +93,7 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
 
 @cache
 def offscreen_context() -> pyrender.OffscreenRenderer:
-    """The process's one OpenGL context; `UserError` where there is none to be had.
-
-    One for all, because closing any context of pyrender's closes its display, and with it the others.
-    """
+    """The process's one OpenGL context, as closing any of pyrender's closes them all; `UserError` without OpenGL."""
     chosen = os.environ.get("PYOPENGL_PLATFORM")
     reasons = []
     for platform in (chosen,) if chosen else PLATFORMS:
@@ -117,8 +112,8 @@ def offscreen_context() -> pyrender.OffscreenRenderer:
 
 
 def _open_context() -> pyrender.OffscreenRenderer:
-    """A context without pyrender's own multisampling, of four samples a pixel: we supersample by ourselves, as raycast
-    does, which leaves each sample either opaque or clear; both would take software OpenGL three times as long."""
+    """A context without pyrender's own multisampling: we supersample by ourselves, as raycast does, which leaves each
+    sample either opaque or clear; both would take software OpenGL three times as long."""
     import pyrender
 
     allocate = pyrender.renderer.glRenderbufferStorageMultisample

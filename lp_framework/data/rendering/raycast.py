@@ -118,10 +118,8 @@ def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 def _shade(
     normal: NDArray[np.float32], view: NDArray[np.float32], colour: NDArray[np.float32], pose: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Light `[n, 3]` that goes out towards the camera, as `compute_brdf` in pyrender's mesh.frag has it.
-
-    The metalness is 0. At roughness 1 the microfacet distribution D is 1 / pi and Smith's k is 1 / 2.
-    """
+    """Light `[n, 3]` towards the camera, as `compute_brdf` in pyrender's mesh.frag has it for metalness 0 and roughness
+    1, at which the microfacet distribution D is 1 / pi and Smith's k is 1 / 2."""
     reflectance = np.float32(0.04)
     nv = np.clip(np.abs((normal * view).sum(axis=1)), 0.001, 1)
     out = AMBIENT * colour

@@ -55,11 +55,8 @@ class Renderer(ABC):
 
 
 def downsample(samples: NDArray[np.uint8], depth: NDArray[np.float32]) -> View:
-    """The view of samples `[H s, W s, 4]` with premultiplied alpha and their depths `[H s, W s]`, s = SUPERSAMPLING.
-
-    The mean over each pixel is taken with premultiplied alpha, so that no background bleeds into the edges; its depth
-    is that of the nearest sample.
-    """
+    """The view of samples `[H s, W s, 4]` with premultiplied alpha and depths `[H s, W s]`, s = SUPERSAMPLING: each
+    pixel's mean, so that no background bleeds into the edges, and the depth of its nearest sample."""
     steps = range(SUPERSAMPLING)
     parts = [(slice(row, None, SUPERSAMPLING), slice(column, None, SUPERSAMPLING)) for row in steps for column in steps]
     sums = np.add.reduce([samples[part] for part in parts], dtype=np.uint16)

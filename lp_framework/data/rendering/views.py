@@ -109,17 +109,13 @@ def _steps(start: float, end: float, step: float) -> NDArray[np.floating]:
 def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> None:
     """Render an object into `<root>/<name>`, whole or not at all, unless it is there already.
 
-    Raises `UserError` when the object does not load, when its folder holds something else than the same object under
-    the same protocol, or when it cannot be written; nothing of the object is left then.
+    Raises `UserError` when it does not load, when its folder holds something else, and when it cannot be written.
     """
     folder = Path(root) / obj.name
     scene = obj.load()
     mesh, settings = fingerprint(scene), asdict(protocol)
     if folder.exists():
         changes = _changes(folder, protocol, mesh=mesh)
-        if changes is None:
-            what = f"was not rendered by this program (it has no proper {RECORD})"
-            raise UserError(f"{folder} exists and {what}; choose another folder or delete it")
         if changes:
             raise UserError(f"{folder} was rendered differently ({changes}); choose another folder or delete this one")
         return
@@ -157,14 +153,14 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
         (partial / RECORD).write_text(json.dumps(record, indent=1))
 
 
-def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str | None:
-    """What the record of an object's views says otherwise than wanted (see `differences`), None without a proper one.
+def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str:
+    """How an object's views differ from what is wanted (see `differences`).
 
     Labels may differ, they are not rendered; depths that are there do no harm where they are not asked for.
     """
     record = read_record(folder / RECORD)
     if not isinstance(record.get("protocol"), dict):
-        return None
+        return f"it has no proper {RECORD}"
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
     return differences({**LATER, **record["protocol"], "mesh": record.get("mesh")}, {**wanted, **mesh})
 
@@ -177,16 +173,15 @@ def render_objects(
     workers: int | None = None,
     check_meshes: bool = True,
 ) -> None:
-    """Render objects into `<root>/<name>`, several at once; finished ones are skipped.
+    """Render objects into `<root>/<name>`, in `workers` processes (None: one a CPU core); finished ones are skipped.
 
-    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them. `workers` is the
-    number of processes, by default one a CPU core; 1 renders in this one. Two runs into one folder take turns.
-    A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
+    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them. Two runs into one
+    folder take turns. A `UserError` of one object does not stop the others; one at the end lists them all.
     """
     todo = list(objects)
     names = [obj.name for obj in todo]
     if not check_meshes:
-        todo = [obj for obj in todo if _changes(Path(root) / obj.name, protocol) != ""]
+        todo = [obj for obj in todo if _changes(Path(root) / obj.name, protocol)]
     if not todo:
         return
     if workers is None:

@@ -8,7 +8,7 @@
     <path>/<category>/<sequence>/pointcloud.ply           the object alone; the challenge's test sequences have none
 
 Cameras are PyTorch3D's. Their world is COLMAP's, of any orientation, origin and scale, and there is no model of the
-object, so its frame is taken from cameras, masks and point cloud (`object_frame`).
+object, so its frame is taken from cameras, masks and point cloud (see `real_cameras`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from torch import Tensor
 
-from lp_framework.data.object_folders import drawn, kept_lists
+from lp_framework.data.object_folders import ObjectLists, drawn, kept_lists
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.reading import expecting, names_below, numbers, read_json
 from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes, from_pytorch3d, ndc_intrinsics
@@ -69,15 +69,14 @@ class CO3DData(PhotographedData):
     def names(self) -> list[str]:
         """The scenes, `<category>-<sequence>`."""
         how = {"subsets": self.subsets, "scenes": self.scenes, "split_seed": self.split_seed}
-        return kept_lists(
-            self.path, how, lambda: drawn(self._available(), self.scenes, 0, self.split_seed, self.download)
-        ).seen
+        return kept_lists(self.path, how, self._choose).seen
 
-    def _available(self) -> list[str]:
-        folders = sorted(self.download.glob("*"))
+    def _choose(self) -> ObjectLists:
+        folders = self.download.glob("*")
         scenes = (f"{folder.name}-{sequence}" for folder in folders for sequence, _ in self._listed(folder))
         looked_for = (f"{self.download}/*/set_lists/set_lists_{subset}.json" for subset in self.subsets)
-        return names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
+        available = names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
+        return drawn(available, self.scenes, 0, self.split_seed, self.download)
 
     def _listed(self, folder: Path) -> set[tuple[str, int]]:
         """Sequence and frame number of every frame in the set lists that a category has; few have all."""
@@ -100,10 +99,8 @@ class CO3DData(PhotographedData):
             raise UserError(f"{file}: has no frame {missing[0]} of sequence '{sequence}', which the set list names")
         photographs = [_photograph(frames[number], self.download, file) for number in sorted(listed)]
         cloud, scores = _cloud_and_scores(folder / "sequence_annotations.jgz", sequence, self.download)
-        try:
+        with expecting(f"{folder / sequence}: the object's frame cannot be told"):
             return _in_object_frame(photographs, cloud, scores)
-        except UserError as error:
-            raise UserError(f"{folder / sequence}: {error}") from error
 
 
 def _of_sequence(file: Path, sequence: str) -> list[dict[str, Any]]:

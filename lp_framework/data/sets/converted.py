@@ -1,8 +1,7 @@
 """Photographs with cameras, converted once into views on disk; everything after that is as with rendered views.
 
-A data set says which photographs an object has, where their cameras are and how large the object is. From them come
-object-centric crops by `real_cameras`, chosen so that their viewpoints are spread evenly. `conversion.json` beside an
-object's views says what they were made from and what was left out.
+Crops around the object by `real_cameras`, chosen so that their viewpoints are spread evenly. `conversion.json` beside
+an object's views says what they were made from and what was left out.
 
 Beside what every `transform.json` has, a frame keeps its photograph (`source`, `width`, `height`), its camera
 (`photograph_camera`, in the object's frame, and `photograph_intrinsics`, pixels), the `turn_degrees` and
@@ -52,10 +51,7 @@ NEAREST = 1.0  # units of the object's longest side; a camera nearer than that i
 @dataclass(frozen=True)
 class Photograph:
     """A photograph of an object: its file, its mask's, its camera `[4, 4]` (camera to world, OpenGL axes, float64) in
-    the object's frame (see `real_cameras`), its intrinsics `[3, 3]` in pixels and its size (width, height).
-
-    Raises `ValueError` for a camera that can be none.
-    """
+    the object's frame (see `real_cameras`), its intrinsics `[3, 3]` in pixels and its size (width, height)."""
 
     file: Path
     mask: Path
@@ -89,10 +85,7 @@ class Annotated(NamedTuple):
 
 
 class ConvertedSource(ViewSource):
-    """Views that are converted from those of a download on first use.
-
-    `download` is its folder, which is only read, and `path` that of the views.
-    """
+    """Views in `path` that are converted on first use from those of a download, whose folder is only read."""
 
     download: Path
 
@@ -105,10 +98,7 @@ class ConvertedSource(ViewSource):
         return {"source": self.download.resolve().name}
 
     def prepare(self) -> None:
-        """Convert what is missing, one object after another.
-
-        A `UserError` of one object does not stop the others; at the end one `UserError` lists them all.
-        """
+        """Convert what is missing, object by object; one `UserError` at the end lists those that could not be."""
         failures: dict[str, str] = {}
         with locked(self.path, ".convert.lock"):
             objects = self.names()
@@ -147,11 +137,7 @@ def frame(file: str, camera: Tensor) -> dict[str, Any]:
 
 
 class PhotographedData(ConvertedSource):
-    """Object-centric crops of photographs with cameras.
-
-    `train_views` and `test_views` photographs of each object are taken, chosen with `split_seed`; their crops are
-    `resolution` pixels a side.
-    """
+    """Object-centric crops of photographs with cameras: so many views of each object, chosen with `split_seed`."""
 
     def __init__(
         self, path: str, views: str, train_views: int, test_views: int, resolution: int, split_seed: int
@@ -237,10 +223,8 @@ class SphericalView(NamedTuple):
 
 
 def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list[SphericalView], Counter[str]]:
-    """The views of an object that are near enough to a spherical camera's, and how many are not, by reason.
-
-    `points` `[P, 3]` are on its bounding box; the perspective residual is theirs.
-    """
+    """The views of an object that are near enough to a spherical camera's, and how many are not, by reason; `points`
+    `[P, 3]` are on its bounding box."""
     left_out: Counter[str] = Counter()
     if not photographs:
         return [], left_out

@@ -39,15 +39,13 @@ class Omni3DData(ConvertedSource):
         self.path = Path(views or f"datasets/{self.download.resolve().name}")
 
     def names(self) -> list[str]:
-        """The objects of the download, sorted."""
-        return omni3d_objects(self.download)
+        names = (folder.name for folder in self.download.glob("*") if (folder / "poses").is_dir())
+        return names_below(self.download, names, "views in ID-Pose's layout", f"{self.download}/OBJECT/poses/*.npy")
 
     def views(self, name: str, split: str) -> ObjectViews:
         if split != "test":
-            raise UserError(
-                f"{self.download}: data=omni3d has test views only, so there is nothing to train on; "
-                "evaluate on it, or train on other data"
-            )
+            only = "data=omni3d has test views only, so there is nothing to train on"
+            raise UserError(f"{self.download}: {only}; evaluate on it, or train on other data")
         return super().views(name, split)
 
     def convert(self, name: str, folder: Path) -> dict[str, Any]:
@@ -64,13 +62,6 @@ class Omni3DData(ConvertedSource):
             frames.append(frame(file.name, camera))
         write_transforms(folder / "test", frames)
         return {}
-
-
-def omni3d_objects(root: str | Path) -> list[str]:
-    """Names of the objects below `root`, sorted: those with a folder of poses; `UserError` where there are none."""
-    root = Path(root)
-    names = (folder.name for folder in root.glob("*") if (folder / "poses").is_dir())
-    return names_below(root, names, "views in ID-Pose's layout", f"{root}/OBJECT/poses/*.npy")
 
 
 def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:

@@ -88,13 +88,9 @@ class RenderedData(ViewSource):
     def names(self) -> list[str]:
         return sorted(obj.name for obj in self.objects())
 
-    def prepare(self) -> None:
-        """Render what is missing. Meshes whose views are there are not loaded."""
-        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers, check_meshes=False)
-
-    def render(self) -> None:
-        """Render what is missing; the meshes of the others must be those that their views were made from."""
-        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers)
+    def prepare(self, check_meshes: bool = False) -> None:
+        """Render what is missing; `check_meshes`: the meshes of the others must be those their views were made from."""
+        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers, check_meshes)
 
     def views(self, name: str, split: str) -> ObjectViews:
         """The views, with the label of the object where it has any, whatever the views were rendered with."""
@@ -177,7 +173,13 @@ class MeshData(RenderedData):
             return [self._object(name) for name in self.available()]
         how = {key: getattr(self, key) for key in ("seen", "unseen", "split_seed")}
         how["renderings"] = None if self.renderings is None else self.renderings.name
-        return [self._object(name) for name in kept_lists(self.path, how, self._choose).named(self.which)]
+        lists = kept_lists(self.path, how, self._choose)
+        names = lists.unseen if self.which == "unseen" else lists.seen
+        if not names:
+            raise UserError(
+                f"data.objects={self.which}: there are none; set data.unseen to the number of unseen objects"
+            )
+        return [self._object(name) for name in names]
 
     def _choose(self) -> ObjectLists:
         available = self.available()
@@ -263,10 +265,8 @@ class ScannedData(MeshData):
 
 
 def load_gso(path: Path) -> trimesh.Scene:
-    """The normalised scene of an object of GSO, turned from +Z up to +Y up.
-
-    Raises `UserError` naming the file when the mesh or its texture is missing or does not load.
-    """
+    """The normalised scene of an object of GSO, turned from +Z up to +Y up; `UserError` naming a file that is missing
+    or does not load."""
     texture = path.parents[1] / "materials" / "textures" / "texture.png"
     for file in (path, texture):
         if not file.is_file():
