@@ -25,8 +25,8 @@ from test_omni3d import write_omni3d
 from view_folders import draw_view, random_poses, transforms, write_split
 
 from lp_framework.data.cache import cached_array, decoded_views
+from lp_framework.data.files import ObjectLists, kept_lists
 from lp_framework.data.meshes import load_scene
-from lp_framework.data.object_folders import ObjectLists, kept_lists
 from lp_framework.data.photographs import read_image
 from lp_framework.data.sets.co3d import CO3DData
 from lp_framework.data.sets.converted import is_converted

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from lp_framework.data.object_folders import ObjectLists, drawn, kept_lists
+from lp_framework.data.files import ObjectLists, drawn, kept_lists
 from lp_framework.data.sets.rendered import MeshData
 from lp_framework.errors import UserError
 

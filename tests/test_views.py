@@ -10,8 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from view_folders import FIELD_OF_VIEW, random_poses, transforms, write_object, write_objects, write_split
 
-from lp_framework.data.reading import LARGEST_RESIDUAL
-from lp_framework.data.views import object_names, read_views
+from lp_framework.data.files import LARGEST_RESIDUAL
+from lp_framework.data.views import RenderingsData, read_views
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, rigid_transform, so3_exp
 
@@ -52,7 +52,7 @@ def sentence(path: Path) -> str:
 
 def test_views_are_read_back_as_they_were_written(tmp_path):
     write_objects(tmp_path, train=5, test=3)
-    assert object_names(tmp_path) == ["cup", "tram", "vase"]
+    assert RenderingsData(tmp_path).names() == ["cup", "tram", "vase"]
     for name, ambiguity, answer in (("cup", "unique", True), ("tram", "twofold", True), ("vase", "continuous", False)):
         for split, count in (("train", 5), ("test", 3)):
             views = read_views(tmp_path, name, split)
@@ -128,7 +128,7 @@ def test_objects_are_folders_with_a_split_in_them(tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / ".cup.partial" / "train").mkdir(parents=True)
     (tmp_path / "readme.txt").write_text("hello")
-    assert object_names(tmp_path) == ["cup", "half"]
+    assert RenderingsData(tmp_path).names() == ["cup", "half"]
 
 
 # ---------------------------------------------------------------- what does not
@@ -136,9 +136,9 @@ def test_objects_are_folders_with_a_split_in_them(tmp_path):
 
 def test_a_root_without_views(tmp_path):
     with pytest.raises(UserError, match=r"nowhere: there is no such folder of views.*data\.path"):
-        object_names(tmp_path / "nowhere")
+        RenderingsData(tmp_path / "nowhere").names()
     with pytest.raises(UserError, match=r"holds no views; looked for .*OBJECT/train/transform\.json"):
-        object_names(tmp_path)
+        RenderingsData(tmp_path).names()
 
 
 def test_a_missing_file(path):

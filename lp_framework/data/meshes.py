@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from lp_framework.data.reading import expecting
+from lp_framework.data.files import expecting
 from lp_framework.errors import UserError
 
 Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]

@@ -136,9 +136,6 @@ class Rows:
     def __init__(self, array: NDArray, rows: NDArray[np.int64]) -> None:
         self.array, self.rows = array, rows
 
-    def __len__(self) -> int:
-        return len(self.rows)
-
     def __getitem__(self, index: int | slice | NDArray[np.int64]) -> NDArray:
         return self.array[self.rows[index]]
 

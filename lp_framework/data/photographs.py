@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageOps
 
 from lp_framework.atomic import written
-from lp_framework.data.reading import expecting
+from lp_framework.data.files import expecting
 from lp_framework.errors import UserError
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
@@ -57,9 +57,8 @@ def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
     first: dict[str, Path] = {}
     for file in files:
         if first.setdefault(file.stem, file) != file:
-            raise UserError(
-                f"{first[file.stem]} and {file} have the same name, so {folder} cannot tell their masks apart"
-            )
+            both = f"{first[file.stem]} and {file}"
+            raise UserError(f"{both} have the same name, so {folder} cannot tell their masks apart")
     masks = {mask.stem: mask for mask in reversed(_images_in(folder))}
     return [masks.get(file.stem) for file in files]
 
@@ -136,9 +135,8 @@ def cut_out(
     opacity = None
     if mask is not None:
         if mask.size != image.size:
-            raise UserError(
-                f"{name}: is {image.width} x {image.height} pixels but its mask is {mask.width} x {mask.height}"
-            )
+            sides = f"{image.width} x {image.height} pixels but its mask is {mask.width} x {mask.height}"
+            raise UserError(f"{name}: is {sides}")
         # What is opaque in a mask with transparency, what is bright in any other.
         opacity = _opacity(mask.getchannel("A")) if mask.mode == "RGBA" else None
         opacity = opacity or _opacity(mask.convert("L"))

@@ -195,7 +195,9 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
     centre = _nearest_point(places, torch.stack([ray.mean(dim=0) for ray in rays]))
     for _ in range(3):  # the middle of a silhouette is that of a view towards the centre
         turned = camera_to_world(view_pose(rigid_transform(torch.eye(3).to(axes), places - centre)))[:, :3, :3]
-        extents = torch.stack([_extent(ray @ turn) for ray, turn in zip(rays, turned, strict=True)])  # [V, 2, 2]
+        seen = [ray @ turn for ray, turn in zip(rays, turned, strict=True)]
+        tangents = [each[:, :2] / -each[:, 2:] for each in seen]
+        extents = torch.stack([torch.stack([each.amin(dim=0), each.amax(dim=0)]) for each in tangents])  # [V, 2, 2]
         middle = torch.cat([extents.mean(dim=1), -torch.ones(len(rays), 1).to(axes)], dim=-1)
         centre = _nearest_point(places, (turned @ middle[..., None]).squeeze(-1))
     distances = (places - centre).norm(dim=-1, keepdim=True)
@@ -247,12 +249,6 @@ def _rays(rotation: Tensor, intrinsics: Tensor, pixels: NDArray[np.float64]) -> 
     points = torch.from_numpy(np.concatenate([pixels, np.ones((len(pixels), 1))], axis=-1))
     seen = torch.linalg.solve(intrinsics, points.mT).mT * points.new_tensor([1.0, -1.0, -1.0])
     return seen @ rotation.mT
-
-
-def _extent(seen: Tensor) -> Tensor:
-    """Least and greatest tangent `[2, 2]` (x and y) of directions `[M, 3]` in a camera's axes."""
-    tangents = seen[:, :2] / -seen[:, 2:]
-    return torch.stack([tangents.amin(dim=0), tangents.amax(dim=0)])
 
 
 def _nearest_point(places: Tensor, directions: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lp_framework.data.reading import check_upright, expecting, names_below, numbers, read_json
+from lp_framework.data.files import check_upright, expecting, names_below, numbers, read_json
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, from_opencv, inverse, to_ifusion, view_pose
 from lp_framework.registry import register
@@ -54,14 +54,6 @@ class ObjectViews:
     def poses(self) -> Tensor:
         """View poses `[V, 3]`, float64."""
         return view_pose(self.cameras)
-
-
-def object_names(root: str | Path) -> list[str]:
-    """Names of the objects below `root`, sorted; an object is a folder with a `train` or a `test` folder."""
-    root = Path(root)
-    folders = (split.parent for split in root.glob("*/*") if split.name in ("train", "test") and split.is_dir())
-    names = (folder.name for folder in folders if not folder.name.startswith("."))
-    return names_below(root, names, "views", f"{root}/OBJECT/train/{TRANSFORMS} and rgb/*.png beside it")
 
 
 def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
@@ -147,8 +139,7 @@ class ViewSource(ABC):
     def names(self) -> list[str]:
         """The objects, sorted; of these alone, whatever else lies in `path`."""
 
-    @abstractmethod
-    def prepare(self) -> None:
+    def prepare(self) -> None:  # noqa: B027
         """Make the views that are missing in `path`, in one process; a run that was stopped is gone on with."""
 
     def views(self, name: str, split: str) -> ObjectViews:
@@ -164,8 +155,7 @@ class RenderingsData(ViewSource):
         self.path = Path(path)
 
     def names(self) -> list[str]:
-        """All objects whose views are in `path`."""
-        return object_names(self.path)
-
-    def prepare(self) -> None:
-        """Nothing is made: the views are there."""
+        """The folders with a `train` or a `test` folder."""
+        splits = (split for split in self.path.glob("*/*") if split.name in ("train", "test") and split.is_dir())
+        names = (split.parent.name for split in splits if not split.parent.name.startswith("."))
+        return names_below(self.path, names, "views", f"{self.path}/OBJECT/train/{TRANSFORMS} and rgb/*.png beside it")

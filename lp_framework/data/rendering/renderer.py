@@ -15,8 +15,6 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 SUPERSAMPLING = 2  # samples a pixel along each side
-
-
 # Parallel lights: the vector towards one in the camera's frame (+X right, +Y up, +Z back), and its intensity.
 LIGHTS = ((-0.6, 0.8, 1.1), 2.5), ((1.0, 0.1, 0.7), 0.65)  # from the upper left behind; from the right
 AMBIENT = 0.2
@@ -39,12 +37,9 @@ class Renderer(ABC):
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> Iterator[View]:
-        """Views of a scene, one after the other, H = W = `resolution`.
-
-        `camera_to_world` is `[V, 4, 4]`, OpenGL style (array or CPU tensor); pixels are square, the optical axis meets
-        the image's centre. What needs to be set up for the scene is set up once. Surfaces are opaque and seen from
-        both sides. Raises `UserError` where the renderer cannot work on this machine.
-        """
+        """Views of a scene, H = W = `resolution`, from cameras `[V, 4, 4]`, OpenGL style (array or CPU tensor), one
+        after the other; what all share is set up once. The optical axis meets the image's centre. Surfaces are
+        opaque and seen from both sides. Raises `UserError` where the renderer cannot work on this machine."""
 
     def render(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float

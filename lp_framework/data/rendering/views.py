@@ -13,7 +13,7 @@ import threading
 import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lp_framework.data.cache import tracked
+from lp_framework.data.files import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.meshes import MeshObject, fingerprint
-from lp_framework.data.object_folders import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, nerf_transforms, write_transforms
 from lp_framework.errors import UserError, check_settings
@@ -179,7 +179,6 @@ def render_objects(
     folder take turns. A `UserError` of one object does not stop the others; one at the end lists them all.
     """
     todo = list(objects)
-    names = [obj.name for obj in todo]
     if not check_meshes:
         todo = [obj for obj in todo if _changes(Path(root) / obj.name, protocol)]
     if not todo:
@@ -191,15 +190,15 @@ def render_objects(
     with locked(Path(root), ".render.lock"):
         work = partial(_work, root=root, protocol=protocol, renderer=renderer)
         done = _in_processes(work, todo, workers) if workers > 1 else map(work, todo)
-        for name, failure, messages in tracked(done, "rendering", len(todo)):
+        for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
             for message in messages:
                 warnings.warn(message, stacklevel=2)
             if failure is not None:
-                failures[name] = failure
-    raise_failures({name: failures[name] for name in names if name in failures}, len(todo), "rendered")
+                failures[obj.name] = failure
+    raise_failures(failures, len(todo), "rendered")
 
 
-Outcome = tuple[str, str | None, list[str]]  # an object's name, the message of its `UserError`, those of its warnings
+Outcome = tuple[str | None, list[str]]  # the message of an object's `UserError`, those of its warnings
 
 
 def _work(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> Outcome:
@@ -210,20 +209,17 @@ def _work(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: R
             render_object(obj, root, protocol, renderer)
         except UserError as error:
             failure = str(error)
-    return obj.name, failure, [str(each.message) for each in caught if issubclass(each.category, UserWarning)]
+    return failure, [str(each.message) for each in caught if issubclass(each.category, UserWarning)]
 
 
 def _in_processes(work: Callable[[MeshObject], Outcome], objects: list[MeshObject], workers: int) -> Iterator[Outcome]:
     context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
-    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
-    try:
-        for future in as_completed([executor.submit(work, obj) for obj in objects]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
-        raise UserError(f"{what}, run the same command again with fewer workers") from error
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as executor:
+        try:
+            yield from executor.map(work, objects)
+        except BrokenProcessPool as error:
+            what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
+            raise UserError(f"{what}, run the same command again with fewer workers") from error
 
 
 def _start_worker() -> None:

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from torch import Tensor
 
-from lp_framework.data.object_folders import ObjectLists, drawn, kept_lists
+from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below, numbers, read_json
 from lp_framework.data.photographs import HALF, read_image
-from lp_framework.data.reading import expecting, names_below, numbers, read_json
 from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes, from_pytorch3d, ndc_intrinsics
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
@@ -135,15 +134,12 @@ def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | Non
     with expecting(f"{file}: sequence '{sequence}' {wanted}"):
         cloud = found[0].get("point_cloud") or {}
         path = root / cloud["path"] if cloud and os.path.isfile(root / cloud["path"]) else None
+        both = {"viewpoint": found[0].get("viewpoint_quality_score"), "point_cloud": cloud.get("quality_score")}
         scores = {
-            "viewpoint_quality_score": _score(found[0].get("viewpoint_quality_score")),
-            "point_cloud_quality_score": _score(cloud.get("quality_score")),
+            f"{of}_quality_score": float(score) if score is not None and math.isfinite(score) else None
+            for of, score in both.items()
         }
     return path, scores
-
-
-def _score(value: Any) -> float | None:
-    return None if value is None or not math.isfinite(float(value)) else float(value)
 
 
 def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: dict[str, float | None]) -> Annotated:

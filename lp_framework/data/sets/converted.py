@@ -28,7 +28,7 @@ from PIL import Image
 from torch import Tensor
 
 from lp_framework.data.cache import tracked
-from lp_framework.data.object_folders import LIST, differences, locked, raise_failures, read_record, written_folder
+from lp_framework.data.files import LIST, differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.photographs import HALF, read_image
 from lp_framework.data.real_cameras import (
     crop_field_of_view,
@@ -115,10 +115,8 @@ class ConvertedSource(ViewSource):
     def _write(self, name: str) -> None:
         folder = self.path / name
         if folder.exists():
-            raise UserError(
-                f"{folder}: holds other views than these settings make (see its {RECORD}); choose another data.views "
-                "or delete it"
-            )
+            others = f"holds other views than these settings make (see its {RECORD})"
+            raise UserError(f"{folder}: {others}; choose another data.views or delete it")
         with written_folder(folder) as partial:
             record = {"object": name, **self.demands(), **self.convert(name, partial)}
             (partial / RECORD).write_text(json.dumps(record, indent=1))

@@ -22,9 +22,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lp_framework.data.object_folders import ObjectLists, kept_lists
+from lp_framework.data.files import ObjectLists, expecting, kept_lists, numbers, read_json
 from lp_framework.data.photographs import opened
-from lp_framework.data.reading import expecting, numbers, read_json
 from lp_framework.data.real_cameras import ObjectFrame, z_up_to_y_up
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
@@ -86,8 +85,6 @@ class HOPEv2Data(PhotographedData):
     def _frames(self) -> dict[int, ObjectFrame]:
         """The objects' frames in those of their models, by number; millimetres."""
         file = self.download / "models" / "models_info.json"
-        if not self.download.is_dir():
-            raise UserError(f"{self.download}: there is no such folder; give data.path=FOLDER of a BOP data set")
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
             frames = {int(number): _frame(info) for number, info in read_json(file).items()}
         if not frames or not all(frame.longest_side > 0 for frame in frames.values()):

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lp_framework.data.files import check_upright, expecting, names_below, numbers
 from lp_framework.data.photographs import read_image
-from lp_framework.data.reading import check_upright, expecting, names_below, numbers
 from lp_framework.data.real_cameras import z_up_to_y_up
 from lp_framework.data.sets.converted import ConvertedSource, frame
 from lp_framework.data.views import ObjectViews, write_transforms
@@ -65,25 +65,19 @@ class Omni3DData(ConvertedSource):
 
 
 def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
-    """Cameras `[4, 4]` (float64) of an object by view, such as "011", with +Y up, their median radius 1.85.
-
-    Raises `UserError` naming the file for a pose that is not readable or no upright camera that looks at the centre,
-    and where an object has fewer than two.
-    """
+    """Cameras `[4, 4]` (float64) of an object by view, such as "011", with +Y up, their median radius 1.85; `UserError`
+    for a pose that is no upright camera that looks at the centre, and for fewer than two."""
     folder = Path(root) / name / "poses"
     files = sorted(folder.glob("*.npy"))
     if len(files) < 2:
         raise UserError(f"{folder}: two or more poses (*.npy) are needed, {len(files)} are there")
-    cameras = torch.stack([_camera(file) for file in files])
+    turned = []
+    for file in files:
+        with expecting(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers"):
+            rows = numbers(np.load(file).astype(np.float64, casting="same_kind")[:3], 3, 4)
+        turned.append(z_up_to_y_up(rigid_transform(rows[:, :3], rows[:, 3])))
+        check_upright(turned[-1], f"{file}: its camera", up="+Z")
+    cameras = torch.stack(turned)
     scale = RADIUS / cameras[:, :3, 3].norm(dim=-1).median()
     scaled = rigid_transform(cameras[:, :3, :3], cameras[:, :3, 3] * scale)
     return {file.stem: camera for file, camera in zip(files, scaled, strict=True)}
-
-
-def _camera(file: Path) -> Tensor:
-    with expecting(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers"):
-        matrix = np.load(file).astype(np.float64, casting="same_kind")
-        rows = numbers(matrix[:3], 3, 4)
-    camera = z_up_to_y_up(rigid_transform(rows[:, :3], rows[:, 3]))
-    check_upright(camera, f"{file}: its camera", up="+Z")
-    return camera

@@ -1,8 +1,7 @@
 """Sources that render meshes: the embedded objects, folders of meshes, and scans as their authors release them.
 
-Of the scanned sets GSO and OmniObject3D the paper takes the 70 objects each that iFusion rendered, and 10 more of GSO
-that are not trained on; it publishes no lists. Where iFusion's renderings are at hand (`renderings`), the seen objects
-are those in there; else the choice is seeded. It is kept in `objects.json` beside the views.
+Of GSO and OmniObject3D the paper takes the 70 objects each that iFusion rendered, and 10 more of GSO that are not
+trained on. Where iFusion's renderings are at hand (`renderings`), the seen objects are those; else they are drawn.
 """
 
 from __future__ import annotations
@@ -22,18 +21,14 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 from trimesh.resolvers import ZipResolver
 
+from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below
 from lp_framework.data.meshes import MeshObject, load_scene, normalise
-from lp_framework.data.object_folders import ObjectLists, drawn, kept_lists
-from lp_framework.data.reading import expecting, names_below
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
 from lp_framework.data.toy import toy_objects
-from lp_framework.data.views import ObjectViews, ViewSource, object_names
+from lp_framework.data.views import ObjectViews, RenderingsData, ViewSource
 from lp_framework.errors import UserError, nearest
 from lp_framework.registry import register
-
-# x, y, z of a world with +Z up become Z, X, Y, as `real_cameras.z_up_to_y_up` has it for cameras.
-_Z_UP_TO_Y_UP = np.eye(4)[[1, 2, 0, 3]]
 
 
 class Label(BaseModel):
@@ -126,7 +121,6 @@ class ToyData(RenderedData):
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:
-        """The embedded objects."""
         return toy_objects()
 
 
@@ -185,7 +179,7 @@ class MeshData(RenderedData):
         available = self.available()
         if self.renderings is None:
             return drawn(available, self.seen, self.unseen, self.split_seed, self.meshes)
-        seen = object_names(self.renderings)
+        seen = RenderingsData(str(self.renderings)).names()
         if missing := sorted({*seen} - {*available}):
             of_these = f"{len(missing)} of the {len(seen)} objects of {self.renderings}"
             raise UserError(f"{self.meshes}: {of_these} are missing, such as {missing[0]}")
@@ -268,14 +262,11 @@ def load_gso(path: Path) -> trimesh.Scene:
     """The normalised scene of an object of GSO, turned from +Z up to +Y up; `UserError` naming a file that is missing
     or does not load."""
     texture = path.parents[1] / "materials" / "textures" / "texture.png"
-    for file in (path, texture):
-        if not file.is_file():
-            raise UserError(f"{file}: there is no such file; an object of GSO needs it")
     with expecting(f"{path}: does not load as a mesh"), path.open("rb") as opened:
         # The material names its texture without the folder.
         files = {file.name: io.BytesIO(file.read_bytes()) for file in (*path.parent.glob("*.mtl"), texture)}
         scene = trimesh.load_scene(opened, file_type="obj", resolver=ZipResolver(files))
-        scene.apply_transform(_Z_UP_TO_Y_UP)
+        scene.apply_transform(np.eye(4)[[1, 2, 0, 3]])  # as `real_cameras.z_up_to_y_up` does it
         return normalise(scene)
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
-from lp_framework.data.object_folders import written_folder
-from lp_framework.data.reading import read_json
+from lp_framework.data.files import read_json, written_folder
 from lp_framework.errors import UserError, one_line
 from lp_framework.priors.zero123.networks import Configs, Dtype, Networks, Weights, assemble, packages
 from lp_framework.priors.zero123.original import Averages, read_original

@@ -1,27 +1,86 @@
-"""Folders of views as they are made: an object's is complete or absent, whatever stops the run.
+"""Files read and folders written: whatever is wrong with one is told in a sentence that names it.
 
-An object is written into a hidden folder that is renamed when all of it is there. A record beside its views says what
-they were made from. `objects.json` in the folder of views, `{"chosen": {how}, "seen": [names], "unseen": [names]}`,
-keeps which objects were chosen: a later run, with more of the data set downloaded, has the same.
+An object's folder of views is complete or absent, whatever stops the run: it is written as a hidden folder that is
+renamed when all of it is there. A record beside the views says what they were made from. `objects.json` in the folder
+of all, `{"chosen": {how}, "seen": [names], "unseen": [names]}`, keeps which objects were chosen: a later run, with more
+of the data set downloaded, has the same.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from filelock import FileLock
 from safetensors import SafetensorError
+from torch import Tensor
 
 from lp_framework.atomic import written
 from lp_framework.errors import UserError
+from lp_framework.geometry import is_rotation, spherical_residual
 
 LIST = "objects.json"
+LARGEST_RESIDUAL = 1.0  # degrees; a camera further from a spherical one is refused
+
+
+def read_json(file: Path) -> Any:
+    """The content of a JSON file, of a gzipped one (.jgz) too."""
+    zipped = file.suffix == ".jgz"
+    with expecting(f"{file}: is not readable {'gzipped ' if zipped else ''}JSON"):
+        content = file.read_bytes()
+        return json.loads(gzip.decompress(content) if zipped else content)
+
+
+@contextmanager
+def expecting(sentence: str) -> Iterator[None]:
+    """Make `UserError`, with what `sentence` says is wanted, of what goes wrong in reading or taking apart."""
+    try:
+        yield
+    except UserError:
+        raise
+    except FileNotFoundError as error:
+        raise UserError(f"{error.filename or error}: there is no such file") from error
+    except Exception as error:  # parsers raise anything from KeyError to struct.error
+        reason = " ".join(str(error).split())
+        raise UserError(f"{sentence} ({type(error).__name__}: {reason})") from error
+
+
+def names_below(root: Path, names: Iterable[str], what: str, looked_for: object) -> list[str]:
+    """Names found in a folder, sorted, each once; `UserError` where there is no such folder and where it has none."""
+    if not root.is_dir():
+        raise UserError(f"{root}: there is no such folder of {what}; give data.path=FOLDER")
+    found = sorted({*names})
+    if not found:
+        raise UserError(f"{root}: holds no {what}; looked for {looked_for}")
+    return found
+
+
+def numbers(values: Any, *shape: int) -> Tensor:
+    """A tensor (float64) of nested lists or an array; to be called within `expecting`, as it raises what torch does
+    and `ValueError` where they are not finite numbers of this shape."""
+    tensor = torch.as_tensor(values, dtype=torch.float64)
+    if tensor.shape != shape or not tensor.isfinite().all():
+        raise ValueError(f"these are not {' x '.join(map(str, shape))} finite numbers")
+    return tensor
+
+
+def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:
+    """`UserError` unless a camera `[4, 4]` is rigid, off the origin, looks at it, and stands upright."""
+    if not is_rotation(camera[:3, :3]) or (camera[3] - camera.new_tensor([0, 0, 0, 1])).abs().max() >= 1e-3:
+        raise UserError(f"{where} is not a rigid camera-to-world transform")
+    if not 1e-6 < camera[:3, 3].norm() < torch.inf:
+        raise UserError(f"{where} must stand off the origin; its distance is {camera[:3, 3].norm():g}")
+    residual = spherical_residual(camera).item()
+    if not residual <= LARGEST_RESIDUAL:
+        off = f"it is {residual:.1f} degrees off, {LARGEST_RESIDUAL:g} are allowed"
+        raise UserError(f"{where} does not look at the origin with {up} up ({off})")
 
 
 @contextmanager
@@ -118,14 +177,10 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
             if not path.exists():
                 with written(path) as partial:
                     partial.write_text(json.dumps({"chosen": how, **lists._asdict()}, indent=1))
-    content = read_record(path)
-    found, seen, unseen = content.get("chosen"), _names(content.get("seen")), _names(content.get("unseen"))
-    if not isinstance(found, dict) or seen is None or unseen is None:
-        raise UserError(f"{path}: is no list of objects as this program writes it; delete it to choose anew")
-    if changed := differences(found, how):
+    content = read_json(path)
+    with expecting(f"{path}: is no list of objects as this program writes it; delete it to choose anew"):
+        changed = differences(content["chosen"], how)
+        seen, unseen = ([str(name) for name in content[key]] for key in ("seen", "unseen"))
+    if changed:
         raise UserError(f"{path}: its objects were chosen otherwise ({changed}); choose another folder of views")
     return ObjectLists(seen, unseen)
-
-
-def _names(value: Any) -> list[str] | None:
-    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else None
