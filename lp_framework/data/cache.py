@@ -101,10 +101,7 @@ def content_key(files: Iterable[Path], *facts: object) -> str:
 
 def decoded_views(files: Sequence[Path], size: int, folder: str | Path) -> tuple[str, NDArray]:
     """Key and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized; decoded once.
-
-    Raises `UserError` naming the file for an image that does not decode, is not square, or differs in size from the
-    others of its folder.
-    """
+    `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
 
     def decode(image: Image.Image) -> NDArray:
         white = Image.fromarray(on_white(image.convert("RGBA")))

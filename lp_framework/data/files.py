@@ -63,8 +63,7 @@ def names_below(root: Path, names: Iterable[str], what: str, looked_for: object)
 
 
 def numbers(values: Any, *shape: int) -> Tensor:
-    """A tensor (float64) of nested lists or an array; to be called within `expecting`, as it raises what torch does
-    and `ValueError` where they are not finite numbers of this shape."""
+    """A tensor (float64) of finite numbers of this shape; raises anything, so it is called within `expecting`."""
     tensor = torch.as_tensor(values, dtype=torch.float64)
     if tensor.shape != shape or not tensor.isfinite().all():
         raise ValueError(f"these are not {' x '.join(map(str, shape))} finite numbers")

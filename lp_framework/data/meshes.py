@@ -1,7 +1,7 @@
 """Meshes: loading any file that trimesh reads, normalising it, and the surfaces that the renderers draw.
 
-A scene is normalised when the centre of its bounding box is the origin and the longest side of the box is 1 (the
-paper, Dataset Construction).
+Normalised is a scene whose bounding box has its centre at the origin and a longest side of 1 (the paper, Dataset
+Construction).
 """
 
 from __future__ import annotations
@@ -76,10 +76,8 @@ def load_scene(path: Path) -> trimesh.Scene:
     with expecting(f"{path}: does not load as a mesh"):
         scene = normalise(trimesh.load_scene(str(path)))
     if plain := sum(not _has_colour(mesh) for mesh in scene.geometry.values()):
-        warnings.warn(
-            f"{path}: {plain} of {len(scene.geometry)} meshes have no texture or colour; they are drawn in light grey",
-            stacklevel=2,
-        )
+        grey = f"{plain} of {len(scene.geometry)} meshes have no texture or colour; they are drawn in light grey"
+        warnings.warn(f"{path}: {grey}", stacklevel=2)
     return scene
 
 

@@ -220,9 +220,8 @@ class PairDataModule(LightningDataModule):
         else:
             pairs, count = data.table.pairs(*(self._evaluation or ("ordered", 0))), self._evaluation_pairs
         batches = in_batches(pairs, count)
-        return self._listed(
-            data, [each for each in batches if not self._left_out.issuperset(map(tuple, each.tolist()))]
-        )
+        left = [each for each in batches if not self._left_out.issuperset(map(tuple, each.tolist()))]
+        return self._listed(data, left)
 
     def _listed(self, data: PairData, batches: Sequence[NDArray[np.int64]]) -> DataLoader[PairBatch]:
         return DataLoader(data, batch_size=None, sampler=share_out(batches, *self._ranks()))

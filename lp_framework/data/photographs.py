@@ -5,9 +5,8 @@ Where the object is, an image's own alpha channel says, a mask file, or rembg. T
 the image's. Background is what is less than half opaque, as in the code of iFusion and ID-Pose.
 
 The prepared image is, nearly, that of a *virtual* camera with the field of view of the priors at the same viewpoint,
-turned to the object's centre and moved along its line of sight until the object fills that share of the frame. So
-latitude and longitude are the photograph's; distance and focal length are lost, and a relative radius compares two
-virtual cameras: it is about 0 where the object looks as large from both.
+turned to the object's centre and moved until the object fills that share of the frame. So latitude and longitude are
+the photograph's, distance and focal length are lost, and a relative radius compares two virtual cameras.
 """
 
 from __future__ import annotations
@@ -81,10 +80,8 @@ def read_image(file: str | Path) -> Image.Image:
 
 
 def upright(image: Image.Image) -> Image.Image:
-    """An image of any mode, turned as its EXIF orientation says: RGBA where it has transparency, else RGB.
-
-    16-bit levels are scaled to 8 bits. Raises `ValueError` for a mode whose white is not known (floating point).
-    """
+    """An image of any mode, with 8 bits, turned as its EXIF orientation says: RGBA where it has transparency, else RGB.
+    Raises `ValueError` for a mode whose white is not known (floating point)."""
     image = ImageOps.exif_transpose(image)
     if image.mode == "F":
         raise ValueError("its pixels are floating-point numbers; save it with 8 or 16 bits")
@@ -129,8 +126,8 @@ def cut_out(
 ) -> Image.Image:
     """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else rembg.
 
-    Where none of them is to be had that is a `UserError` if `required`, else the whole image is opaque. `UserError`,
-    too, for a mask of another size or without background; `name` is what errors call the image.
+    `UserError`, which calls the image `name`, for a mask of another size or without background, and where none of the
+    three is to be had; that leaves the whole image opaque unless it is `required`.
     """
     opacity = None
     if mask is not None:
@@ -187,11 +184,7 @@ def crop_to_object(image: Image.Image, name: str) -> Image.Image:
 
 
 def prepare(
-    image: Image.Image,
-    name: str,
-    mask: Image.Image | None = None,
-    remove_background: bool = False,
-    crop: bool = True,
+    image: Image.Image, name: str, mask: Image.Image | None = None, remove_background: bool = False, crop: bool = True
 ) -> Image.Image:
     """RGBA of `SIZE` pixels a side: by `cut_out` and `crop_to_object`, or, without `crop`, the whole image, which must
     be square; one without background then shows the object on white."""

@@ -10,12 +10,10 @@ corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). It sta
 2. *Crop.* The homography also chooses the field of view of the square crop. It is the one in which the object's centre
    plane looks as large as it does to a camera of the priors' field of view F at the *effective radius* r:
    tan(crop / 2) = r / distance * tan(F / 2). Any r could be had; `effective_radii` says which are taken.
-3. *Residual.* The crop is not that camera's image: seen from another distance, near parts look larger or smaller.
-   `perspective_residual` is that difference.
+3. *Residual.* Seen from another distance, near parts look larger or smaller; `perspective_residual` says by how much.
 
-Where there is no model of the object, its frame follows from the cameras around it: up is the direction to which their
-right axes are closest to perpendicular, as photographers hold cameras level; centre and longest side are those of its
-silhouettes (`frame_of_silhouettes`) or of its point cloud (`frame_of_points`).
+Where there is no model of the object, up is the direction to which the cameras' right axes are closest to
+perpendicular: photographers hold cameras level. Its silhouettes or its point cloud tell its centre and longest side.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from lp_framework.geometry import camera_to_world, geodesic_angle, inverse, rigi
 NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
 STRAY = 0.01  # share of a cloud's points beyond either side of its box: reconstructions have stray points
 POINTS = 20_000  # of a cloud that its box is taken from
-FARTHEST_APART, MOST_LARGER = 0.25, 1.5  # of the box of a cloud that agrees with the silhouettes: see `agrees`
+FARTHEST_APART, MOST_LARGER = 0.25, 1.5  # of longest sides, for the centres, and times, for the sides: see `agrees`
 
 
 def from_pytorch3d(rotation: Tensor, translation: Tensor) -> Tensor:
@@ -174,8 +172,7 @@ class ObjectFrame(NamedTuple):
         return torch.cartesian_prod(*(torch.stack([-side, side]) / 2 for side in self.sides))
 
     def agrees(self, other: ObjectFrame) -> bool:
-        """Whether another account of the object has its centre no further away than a quarter of the other's longest
-        side, and that side no more than half as long again, or shorter by as much."""
+        """Whether another account of the object has about the same centre and longest side."""
         apart = (self.centre - other.centre).norm() / other.longest_side
         larger = self.longest_side / other.longest_side
         return bool(apart <= FARTHEST_APART and 1 / MOST_LARGER <= larger <= MOST_LARGER)

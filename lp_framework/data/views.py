@@ -57,11 +57,8 @@ class ObjectViews:
 
 
 def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
-    """The views of an object in a split ("train" or "test").
-
-    Raises `UserError` naming the file for a missing or malformed `transform.json`, a missing image, and a matrix that
-    is not a camera that looks at the origin.
-    """
+    """The views of an object in a split ("train" or "test"); `UserError` naming the file for a missing or malformed
+    `transform.json`, a missing image, and a matrix that is not a camera that looks at the origin."""
     path = Path(root) / name / split / TRANSFORMS
     content = read_json(path)
     with expecting(f"{path}: needs camera_angle_x and frames with file_path and transform_matrix"):
@@ -96,11 +93,8 @@ def write_transforms(folder: Path, frames: list[dict[str, Any]], **more: Any) ->
 
 
 def nerf_transforms(files: Sequence[str], poses: Tensor, field_of_view_degrees: float) -> dict[str, Any]:
-    """The contents of a `transforms.json` as iFusion writes it, which NeRF programs read as well.
-
-    `files` are paths relative to it. `transform_matrix` is camera-to-world (OpenGL axes, +Y up), `latlon` iFusion's:
-    down-positive latitude and longitude in degrees, radius.
-    """
+    """The contents of a `transforms.json` as iFusion writes it, which NeRF programs read as well; `files` are relative
+    to it, `latlon` is down-positive latitude and longitude in degrees, radius."""
     poses = poses.double()
     frames = [
         {"file_path": file, "transform_matrix": matrix, "latlon": latlon}

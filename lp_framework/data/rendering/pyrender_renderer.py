@@ -117,11 +117,7 @@ def _open_context() -> pyrender.OffscreenRenderer:
     import pyrender
 
     allocate = pyrender.renderer.glRenderbufferStorageMultisample
-
-    def single_sampled(target: int, _samples: int, *sizes: int) -> None:
-        allocate(target, 0, *sizes)
-
-    pyrender.renderer.glRenderbufferStorageMultisample = single_sampled
+    pyrender.renderer.glRenderbufferStorageMultisample = lambda target, _, *sizes: allocate(target, 0, *sizes)
     return pyrender.OffscreenRenderer(64, 64)
 
 

@@ -107,10 +107,8 @@ def _steps(start: float, end: float, step: float) -> NDArray[np.floating]:
 
 
 def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> None:
-    """Render an object into `<root>/<name>`, whole or not at all, unless it is there already.
-
-    Raises `UserError` when it does not load, when its folder holds something else, and when it cannot be written.
-    """
+    """Render an object into `<root>/<name>`, whole or not at all, unless it is there already; `UserError` when it does
+    not load, when its folder holds something else, and when it cannot be written."""
     folder = Path(root) / obj.name
     scene = obj.load()
     mesh, settings = fingerprint(scene), asdict(protocol)
@@ -154,10 +152,8 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
 
 
 def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str:
-    """How an object's views differ from what is wanted (see `differences`).
-
-    Labels may differ, they are not rendered; depths that are there do no harm where they are not asked for.
-    """
+    """How an object's views differ from what is wanted (see `differences`). Labels may differ, they are not rendered;
+    depths that are there do no harm where they are not asked for."""
     record = read_record(folder / RECORD)
     if not isinstance(record.get("protocol"), dict):
         return f"it has no proper {RECORD}"

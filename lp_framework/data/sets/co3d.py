@@ -44,8 +44,8 @@ BLACK = 8  # an image that is nowhere brighter is one that was blackened for the
 class CO3DData(PhotographedData):
     """CO3Dv2's single-sequence subset: crops around the object of each scene, converted into `views` on first use.
 
-    `scenes` of the sequences in the set lists of `subsets` are taken, drawn with `split_seed` and kept in
-    `objects.json`; of each, `train_views` + `test_views` frames are chosen for their viewpoints.
+    `scenes` of the sequences in the set lists of `subsets` are drawn with `split_seed` and kept in `objects.json`; of
+    each, `train_views` + `test_views` frames are chosen for their viewpoints.
     """
 
     def __init__(

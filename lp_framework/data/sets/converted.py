@@ -27,17 +27,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from lp_framework.data import real_cameras
 from lp_framework.data.cache import tracked
 from lp_framework.data.files import LIST, differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.photographs import HALF, read_image
-from lp_framework.data.real_cameras import (
-    crop_field_of_view,
-    crop_homography,
-    effective_radii,
-    perspective_residual,
-    spherical_camera,
-    turn_towards_centre,
-)
 from lp_framework.data.views import ViewSource, write_transforms
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import is_rotation, to_ifusion, view_pose
@@ -196,9 +189,9 @@ class PhotographedData(ConvertedSource):
 
     def _frame(self, file: str, view: SphericalView) -> dict[str, Any]:
         photograph, radius = view.photograph, view.radius
-        angle = crop_field_of_view(photograph.camera[:3, 3].norm(), radius)
+        angle = real_cameras.crop_field_of_view(photograph.camera[:3, 3].norm(), radius)
         return {
-            **frame(file, spherical_camera(photograph.camera, radius)),
+            **frame(file, real_cameras.spherical_camera(photograph.camera, radius)),
             "source": os.path.relpath(photograph.file, self.download),
             "width": photograph.size[0],
             "height": photograph.size[1],
@@ -228,9 +221,9 @@ def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list
         return [], left_out
     cameras = torch.stack([photograph.camera for photograph in photographs])
     distances = cameras[:, :3, 3].norm(dim=-1)
-    radii = effective_radii(distances)
-    residuals = perspective_residual(cameras, radii, points)
-    _, turns = turn_towards_centre(cameras)
+    radii = real_cameras.effective_radii(distances)
+    residuals = real_cameras.perspective_residual(cameras, radii, points)
+    _, turns = real_cameras.turn_towards_centre(cameras)
     views = []
     for index, photograph in enumerate(photographs):
         if distances[index] < NEAREST:
@@ -260,7 +253,7 @@ def crop(view: SphericalView, size: int) -> Image.Image:
     photograph = view.photograph
     cut = photograph.read(photograph.file, "RGB")
     cut.putalpha(photograph.read(photograph.mask, "L"))
-    homography = crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
+    homography = real_cameras.crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
     # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing.
     larger = max(1, math.ceil(_magnification(homography, size) - 0.05))
     homography = homography / torch.tensor([larger, larger, 1.0], dtype=torch.float64)

@@ -47,8 +47,8 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
         bbq_sauce: {ambiguity: continuous, unique_answer: true, reason: "a bottle; its label is on one side"}
         butter: {ambiguity: twofold, reason: "a box that says something else on each side"}
 
-    Warns of objects that the file leaves out; they stay unlabelled. Raises `UserError` naming the file, and the object,
-    for a file that is missing or no YAML, for an object that is not in the folder and for a label that is none.
+    Warns of objects that the file leaves out; they stay unlabelled. `UserError` naming file and object for what is
+    missing, no YAML, not in the folder, or no label.
     """
     with expecting(f"{path}: is not readable YAML"):
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -170,9 +170,8 @@ class MeshData(RenderedData):
         lists = kept_lists(self.path, how, self._choose)
         names = lists.unseen if self.which == "unseen" else lists.seen
         if not names:
-            raise UserError(
-                f"data.objects={self.which}: there are none; set data.unseen to the number of unseen objects"
-            )
+            hint = "set data.unseen to the number of unseen objects"
+            raise UserError(f"data.objects={self.which}: there are none; {hint}")
         return [self._object(name) for name in names]
 
     def _choose(self) -> ObjectLists:
