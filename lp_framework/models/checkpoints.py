@@ -21,8 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lp_framework import registry
-from lp_framework.data.object_folders import written_folder
-from lp_framework.data.reading import read_json
+from lp_framework.data.files import read_json, written_folder
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import RECIPE, TrainedModule
