@@ -11,6 +11,8 @@ from solver_problems import ExactModel, exact_pairs
 
 from lp_framework import registry
 from lp_framework.errors import UserError
+from lp_framework.models.backbones import EfficientNetLite0Maps
+from lp_framework.models.matching import MatchingModel
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.starts import Grid, Random, Ring, Starts
 
@@ -27,7 +29,8 @@ PAIRS = with_ids(IDS)
 
 @pytest.mark.parametrize("name", registry.names("start"))
 def test_every_kind_of_start_keeps_its_contract(name):
-    starts = registry.build("start", {"name": name})
+    model = MatchingModel(EfficientNetLite0Maps(), width=16, layers=1, cells=32).eval()
+    starts = registry.build("start", {"name": name}, model=model)
     first, again = starts.make(PAIRS, seed=3), starts.make(PAIRS, seed=3)
     assert first.shape == (len(IDS), starts.count, 3)
     assert first.dtype == torch.float32
@@ -35,9 +38,8 @@ def test_every_kind_of_start_keeps_its_contract(name):
     assert torch.equal(first, again)
     order = torch.tensor([2, 0, 3, 1])
     assert torch.equal(starts.make(with_ids(IDS[order]), seed=3), first[order])
-    assert torch.equal(
-        torch.cat([starts.make(with_ids(IDS[:1]), seed=3), starts.make(with_ids(IDS[1:]), seed=3)]), first
-    )
+    parts = [starts.make(with_ids(IDS[:1]), seed=3), starts.make(with_ids(IDS[1:]), seed=3)]
+    torch.testing.assert_close(torch.cat(parts), first, rtol=1e-5, atol=1e-5)  # a network's products round by batch
 
 
 @pytest.mark.parametrize("count", [1, 3, 4])

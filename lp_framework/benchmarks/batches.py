@@ -13,14 +13,14 @@ from torch import Tensor
 from lp_framework.benchmarks.harness import Section, Work, worth
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import BlockSampler, PairBatch
-from lp_framework.models.pose_model import PoseModel
+from lp_framework.models.pose_model import DenoisingModel
 from lp_framework.priors.base import Prior
 
 LOADING = "loader: a training step", ("pairs in feature space", "plain pair loader")
 ENCODING = "encoding: the images of pairs", ("each view once", "two images a pair")
 
 
-def measure_loading(section: Section, data: PairDataModule, new_model: PoseModel, rounds: int, steps: int) -> None:
+def measure_loading(section: Section, data: PairDataModule, new_model: DenoisingModel, rounds: int, steps: int) -> None:
     """Training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
     optimizer = torch.optim.Adam(new_model.parameters(), lr=0.0)  # the weights stay, so every step does the same work
 
@@ -45,7 +45,9 @@ def measure_loading(section: Section, data: PairDataModule, new_model: PoseModel
     section.race(works, rounds, rate=True, warm_up=False)
 
 
-def measure_encoding(section: Section, data: PairDataModule, new_model: PoseModel, prior: Prior, rounds: int) -> None:
+def measure_encoding(
+    section: Section, data: PairDataModule, new_model: DenoisingModel, prior: Prior, rounds: int
+) -> None:
     """Pairs a second through the model's backbone, through the prior's encoder, and in training on a frozen backbone.
 
     The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
@@ -86,7 +88,7 @@ def measure_encoding(section: Section, data: PairDataModule, new_model: PoseMode
     )
 
 
-def _told(data: PairDataModule, model: PoseModel) -> str:
+def _told(data: PairDataModule, model: DenoisingModel) -> str:
     return f"images of {model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
 
 
@@ -116,12 +118,12 @@ def two_images_a_pair(batch: PairBatch) -> PairBatch:
 
 
 @torch.no_grad()
-def trunk_features(model: PoseModel, images: Tensor) -> Tensor:
+def trunk_features(model: DenoisingModel, images: Tensor) -> Tensor:
     """`[I, trunk_dim]` of images `[I, 3, H, W]`, without a graph, as of a frozen trunk."""
     return model.backbone.trunk(images)
 
 
-def loss_on(model: PoseModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:
+def loss_on(model: DenoisingModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:
     """The objective of a batch, of its images or of its views' features `[I, D]` where these are given."""
     if features is None:
         features = model.encode(batch.images)
@@ -130,7 +132,7 @@ def loss_on(model: PoseModel, batch: PairBatch, features: Tensor | None = None) 
     return model.pair_loss(condition, torch.zeros_like(true), true).mean()
 
 
-def kept_for_backward(model: PoseModel, batch: PairBatch) -> float:
+def kept_for_backward(model: DenoisingModel, batch: PairBatch) -> float:
     """Bytes a pair of the activations that a step keeps for its backward pass."""
     storages: dict[int, int] = {}
     parameters = {parameter.data_ptr() for parameter in model.parameters()}

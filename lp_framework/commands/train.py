@@ -73,6 +73,7 @@ def run(config: DictConfig) -> None:
     model.recipe = recipe
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
+    data.carry(*model.carries)
     loggers: list[Logger] = [CSVLogger(folder, name="", version="")]  # `METRICS` in the run's folder
     if config.logger.tensorboard:
         loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))

@@ -121,12 +121,18 @@ def decoded_alpha(files: Sequence[Path], size: int, folder: str | Path, views: s
     return cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding alpha"))
 
 
-def decoded_depths(files: Sequence[Path], size: int, folder: str | Path) -> NDArray:
-    """The depths `[N, size, size]` (float32) that belong to image files (see `views`): along the optical axis, in scene
-    units, 0 where there is nothing; of the sample nearest to each pixel. `UserError` where a view has none."""
+def depth_files(files: Sequence[Path]) -> list[Path]:
+    """The depths that belong to image files; `UserError` where a view has none."""
     depths = [file.parents[1] / "depth" / file.name for file in files]
     if missing := [file for file in depths if not file.is_file()]:
         raise UserError(f"{missing[0]}: there is no such file; views rendered with data.depth=true have depths")
+    return depths
+
+
+def decoded_depths(files: Sequence[Path], size: int, folder: str | Path) -> NDArray:
+    """The depths `[N, size, size]` (float32) that belong to image files (see `views`): along the optical axis, in scene
+    units, 0 where there is nothing; of the sample nearest to each pixel. `UserError` where a view has none."""
+    depths = depth_files(files)
 
     def decode(image: Image.Image) -> NDArray:
         levels = np.asarray(image.resize((size, size), Image.Resampling.NEAREST))

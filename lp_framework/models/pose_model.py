@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch
-from lp_framework.errors import check_settings
+from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import keyed_normal, keyed_uniform
 from lp_framework.models.backbones import Backbone
 from lp_framework.models.networks import PoseNetwork
@@ -34,16 +34,46 @@ class FieldValue(NamedTuple):
 
 
 class PoseModel(TrainedModule):
-    """A score or energy of the relative pose, given two images; a subclass says what its network's output means.
+    """A score or energy of the relative pose, given two images.
 
     Solvers ask three things of it: `encode` images once, `condition` on pairs of them, then the `field` at any poses.
     Of *codes* they ask only that an index tensor picks from them as from a batch, `codes[pairs.reference]`; of a
     *condition* that it can be indexed along the pairs and given further dimensions there, `condition[:, None]`, so that
-    it broadcasts against poses `[B, N, 3]`. Here both are tensors; they may be any object that does so.
+    it broadcasts against poses `[B, N, 3]`. They may be tensors or any object that does so.
     """
 
     sigma: float  # radians and scene units: the field's score is (truth - x) / sigma^2 near an only truth
+    kernel: PoseKernel  # of the noise
     has_energy: bool  # whether `field` gives an energy beside the score
+    choose_by: Literal["distance", "energy"] = "distance"  # what tells the best of several ends, see solver=langevin
+
+    @abstractmethod
+    def encode(self, images: Tensor) -> Any:
+        """Codes of images `[I, 3, H, W]` in [-1, 1]."""
+
+    @abstractmethod
+    def condition(self, reference: Any, query: Any) -> Any:
+        """The condition of P pairs, from the codes of either side."""
+
+    @abstractmethod
+    def field(self, condition: Any, pose: Tensor) -> FieldValue:
+        """Score (and energy) at relative poses `[..., 3]`, at the model's `sigma`."""
+
+    def modes(self, condition: Any, count: int) -> Tensor:
+        """The most likely poses `[P, count, 3]`, best first; `UserError` of a model that cannot tell them."""
+        raise UserError("start=modes needs model=matching; score and energy networks cannot tell their modes")
+
+    def at_sigma(self, condition: Any, sigma: float) -> Any:
+        """The condition under which `field` is at another `sigma`; `UserError` of a model that knows only one."""
+        raise UserError(
+            "solver.sigma needs model=matching, whose field is known at every sigma; score and energy networks know "
+            f"the one that they were trained at, {self.sigma:g}"
+        )
+
+
+class DenoisingModel(PoseModel):
+    """A network on the pooled features of two images; a subclass says what its output means."""
+
     outputs: int  # of the network
 
     def __init__(
@@ -137,7 +167,7 @@ class PoseModel(TrainedModule):
 
 
 @register("model", "score")
-class ScoreModel(PoseModel):
+class ScoreModel(DenoisingModel):
     """Score network trained by denoising score matching (paper, Eq. 3)."""
 
     has_energy, outputs = False, 3
@@ -152,7 +182,7 @@ class ScoreModel(PoseModel):
 
 
 @register("model", "energy")
-class EnergyModel(PoseModel):
+class EnergyModel(DenoisingModel):
     """Energy network trained on its closed-form target (paper, appendix "Energy-based Modeling")."""
 
     has_energy, outputs = True, 1

@@ -23,6 +23,8 @@ class TrainedModule(LightningModule):
 
     recipe: Mapping[str, Any] | None = None
 
+    carries: tuple[Literal["alpha", "depth", "points"], ...] = ()  # what of the views its batches have besides images
+
     def __init__(
         self,
         backbone: Backbone,

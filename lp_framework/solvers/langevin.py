@@ -25,7 +25,11 @@ class Langevin(Solver):
 
     `choose_by` says by what the answer is chosen among the ends: `distance`, the least distance to the truth that the
     field itself tells, so that under noise it is the end that happens to be nearest; `agreement`, the least median
-    distance to the other ends; `energy`, that of an energy model.
+    distance to the other ends; `energy`, that of an energy model; by default what the model says.
+
+    `sigma` is for models whose field is known at every sigma (`matching`): one, or the first and the last step's,
+    between which it falls geometrically. Steps are alpha sigma^2 / (the model's sigma)^2 long then, so that each leaves
+    the same share of the way to an only truth, and the noise goes with sigma.
     """
 
     def __init__(
@@ -34,7 +38,8 @@ class Langevin(Solver):
         alpha: float = 0.1,
         gamma: float | Sequence[float] = (0.0, 0.3, 0.0),
         iterations: int = 50,
-        choose_by: Literal["distance", "agreement", "energy"] = "distance",
+        choose_by: Literal["distance", "agreement", "energy"] | None = None,
+        sigma: float | Sequence[float] | None = None,
         trajectory: bool = False,
     ) -> None:
         limit = 2 * model.sigma**2  # a step leaves 1 - alpha / sigma^2 of the way to the truth
@@ -47,7 +52,8 @@ class Langevin(Solver):
             raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use distance")
         self.model = model
         self.alpha, self.gamma = alpha, _triple(gamma)
-        self.iterations, self.choose_by, self.trajectory = iterations, choose_by, trajectory
+        self.iterations, self.choose_by, self.trajectory = iterations, choose_by or model.choose_by, trajectory
+        self.sigmas = None if sigma is None else _falling(sigma, iterations)
 
     @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
@@ -58,8 +64,13 @@ class Langevin(Solver):
         condition = self.model.condition(codes[pairs.reference], codes[pairs.query])[:, None]  # [B, 1, ...]
         noise = self._noise(pairs, starts, seed)
         pose, trajectory = starts, [starts]
+        ratio = 1.0
         for step in steps_of(self.iterations, "first stage"):
-            pose = pose + self.alpha * self.model.field(condition, pose).score + noise[:, :, step]
+            if self.sigmas is not None:
+                condition = self.model.at_sigma(condition, self.sigmas[step])
+                ratio = self.sigmas[step] / self.model.sigma
+            score = self.model.field(condition, pose).score
+            pose = pose + self.alpha * ratio**2 * score + ratio * noise[:, :, step]
             trajectory.append(pose)
         energies = self._energies(condition, pose)
         looks = self.iterations + {"distance": 3, "energy": 1, "agreement": 0}[self.choose_by]
@@ -105,6 +116,17 @@ class Langevin(Solver):
         slope = (ahead - behind) / (2 * step[1])
         beyond = torch.where(slope > 0, variance**2 * slope + variance, 0.0)
         return (variance**2 * score.square().sum(dim=-1) + beyond).sqrt()
+
+
+def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:
+    """`sigma` of every step."""
+    ends = [sigma] * 2 if isinstance(sigma, int | float) else [*sigma]
+    if len(ends) != 2 or not all(0 < each < math.inf for each in ends):
+        raise UserError(
+            f"solver.sigma must be one positive number, or two (the first and the last step's); got {sigma}"
+        )
+    first, last = ends
+    return [first * (last / first) ** (step / max(1, steps - 1)) for step in range(steps)]
 
 
 def _triple(gamma: float | Sequence[float]) -> list[float]:

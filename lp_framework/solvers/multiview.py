@@ -40,7 +40,8 @@ class MultiView(Solver):
     """Joint reasoning over 2 to 8 images: pairwise first stage, a robust fit of absolute poses, joint refinement.
 
     All ends of the first stage are measurements for the fit, weighted by 1 / (d^2 + 0.1^2), with d the distance to the
-    truth that the model tells there (`choose_by=distance` of `langevin`). Without `first_stage` the second descends
+    truth that the model tells there (`choose_by=distance` of `langevin`), or, where the model has a density, by that
+    density. Without `first_stage` the second descends
     from the starts themselves, number n of all images together, and the answer has the least energy on `rescoring`
     noises and timesteps, the same for all. A pair is a set of two.
     """
@@ -129,8 +130,9 @@ class MultiView(Solver):
         poses = starts.new_full((sets, views, views, starts.shape[2], 3), torch.nan)
         poses[:, reference, query] = solution.poses.unflatten(0, (sets, -1))
         weights = torch.zeros_like(poses[..., 0])
-        distance = solution.energies.unflatten(0, (sets, -1))
-        weights[:, reference, query] = 1 / (distance.square() + NEAREST**2)
+        told = solution.energies.unflatten(0, (sets, -1))
+        by_density = self.first.choose_by == "energy"
+        weights[:, reference, query] = (-told).exp() if by_density else 1 / (told.square() + NEAREST**2)
         return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
     def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import keyed_uniform
+from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.base import Pairs
 
@@ -78,3 +79,17 @@ class Random(Starts):
         uniform = keyed_uniform(seed, _STARTS, pairs.ids[:, None], torch.arange(self.count), count=2)
         latitude, longitude = (2 * uniform[..., 0] - 1) * self.latitude, uniform[..., 1] * 2 * math.pi
         return torch.stack([latitude, longitude, torch.zeros_like(latitude)], dim=-1).float().to(pairs.ids.device)
+
+
+@register("start", "modes")
+class Modes(Starts):
+    """The `count` most likely relative poses that the model itself tells, best first (`model=matching`)."""
+
+    def __init__(self, model: PoseModel, count: int = 4) -> None:
+        check_settings("start", ("count", count, count >= 1, "at least 1"))
+        self.model, self.count = model, count
+
+    @torch.no_grad()
+    def make(self, pairs: Pairs, seed: int) -> Tensor:
+        codes = self.model.encode(pairs.images)
+        return self.model.modes(self.model.condition(codes[pairs.reference], codes[pairs.query]), self.count)

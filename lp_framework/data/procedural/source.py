@@ -25,6 +25,7 @@ class ProceduralData(RenderedData):
         train_views: int = 16,
         lowest_latitude_degrees: float = -30.0,
         highest_latitude_degrees: float = 30.0,
+        field_of_view_range: list[float] | None = None,
         depth: bool = False,
         workers: int | None = None,
     ) -> None:
@@ -37,7 +38,7 @@ class ProceduralData(RenderedData):
         super().__init__(
             renderer, path, workers, resolution=resolution, test_views=test_views, train_views=train_views,
             lowest_latitude_degrees=lowest_latitude_degrees, highest_latitude_degrees=highest_latitude_degrees,
-            depth=depth,
+            field_of_view_range=field_of_view_range, depth=depth,
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +33,8 @@ from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import camera_to_world
 
 RECORD = "render.json"
-LATER = {"train_views": None, "depth": False}  # settings that records leave out at these values, as older ones do
+# Settings that records leave out at these values, as older ones do.
+LATER = {"train_views": None, "depth": False, "field_of_view_range": None}
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,9 @@ class ViewProtocol:
 
     The training views lie on a grid of latitudes and longitudes (degrees, the latitudes with both ends), each at a
     random radius (scene units); the test views are random in the same ranges, and so are the training views where
-    their number `train_views` is given. With `depth` the views' depths are kept as well.
+    their number `train_views` is given. With `depth` the views' depths are kept as well. With `field_of_view_range`
+    (degrees) each object is seen with a field of view of its own, drawn from the range, from as much nearer or farther
+    that it looks as large as with `field_of_view_degrees`.
     """
 
     resolution: int = 512
@@ -57,12 +60,13 @@ class ViewProtocol:
     seed: int = 0
     train_views: int | None = None
     depth: bool = False
+    field_of_view_range: list[float] | None = None
 
     def __post_init__(self) -> None:
         low, high = self.lowest_latitude_degrees, self.highest_latitude_degrees
         near, far, angle = self.nearest_radius, self.farthest_radius, self.field_of_view_degrees
         steps = {key: getattr(self, key) for key in ("latitude_step_degrees", "longitude_step_degrees")}
-        few = self.train_views
+        few, fields = self.train_views, self.field_of_view_range
         check_settings(
             "data",
             ("resolution", self.resolution, self.resolution >= 1, "at least 1"),
@@ -70,8 +74,22 @@ class ViewProtocol:
             ("train_views", few, few is None or few >= 1, "at least 1, or null for the grid"),
             *((key, step, step > 0, "positive") for key, step in steps.items()),
             ("field_of_view_degrees", angle, 0 < angle < 180, "between 0 and 180"),
+            ("field_of_view_range", fields, fields is None or (len(fields) == 2 and 0 < fields[0] <= fields[1] < 180),
+             "two angles between 0 and 180 degrees in ascending order, or null"),
             ("lowest_latitude_degrees", low, -90 <= low <= high <= 90, f"from -90 to the highest, {high}"),
             ("nearest_radius", near, 0 < near <= far, f"from 0 to the farthest, {far}"),
+        )  # fmt: skip
+
+    def of_object(self, name: str) -> ViewProtocol:
+        """The protocol of one object, whose field of view is a number."""
+        if self.field_of_view_range is None:
+            return self
+        low, high = self.field_of_view_range
+        angle = self._random(name, "field of view").uniform(low, high)
+        nearer = math.tan(math.radians(self.field_of_view_degrees) / 2) / math.tan(math.radians(angle) / 2)
+        near, far = self.nearest_radius * nearer, self.farthest_radius * nearer
+        return replace(
+            self, field_of_view_degrees=angle, field_of_view_range=None, nearest_radius=near, farthest_radius=far
         )
 
     def training_poses(self, object_name: str) -> NDArray[np.float64]:
@@ -125,6 +143,7 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
         **labels,
         "protocol": {key: value for key, value in settings.items() if key not in LATER or value != LATER[key]},
     }
+    protocol = protocol.of_object(obj.name)
     splits = {"train": protocol.training_poses(obj.name), "test": protocol.test_poses(obj.name)}
 
     with written_folder(folder) as partial:

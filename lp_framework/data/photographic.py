@@ -1,0 +1,163 @@
+"""Renderings made to look like photographs that `data.photographs.prepare` has cut out, centred and scaled.
+
+What a person's photographs have and renderings have not: a camera that is not quite upright, other light and exposure,
+blur, the traces of JPEG, a mask that is a little wrong, and the crop to the object, which loses its distance.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from PIL import Image, ImageFilter
+
+from lp_framework.data.cache import cached_array, content_key, depth_files, tracked
+from lp_framework.data.photographs import EXTENT, SIZE, on_white, opened
+from lp_framework.data.views import DEPTH_UNIT, ObjectViews
+from lp_framework.keyed_random import stable_id
+
+ROLL_DEGREES = 10.0  # at most, to either side
+
+
+def like_photograph(
+    view: NDArray[np.uint8], points: NDArray[np.float32], random: Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """RGBA `[SIZE, SIZE, 4]` and the points in space `[SIZE, SIZE, 3]` that its pixels show, of a rendering `[H, W, 4]`
+    with points `[H, W, 3]` (NaN where it shows nothing)."""
+    matrix = _to_crop(view[..., 3], math.radians(random.uniform(-ROLL_DEGREES, ROLL_DEGREES)), random)
+    ground = tuple((random.uniform(0, 255) + random.uniform(-40, 40, 3)).clip(0, 255).astype(int).tolist())
+    image = Image.fromarray(view)
+    alpha = image.getchannel("A")
+    scene = Image.composite(image.convert("RGB"), Image.new("RGB", image.size, ground), alpha)
+    coefficients = tuple(matrix[:2].reshape(-1))
+    size = (SIZE, SIZE)
+    scene = scene.transform(size, Image.Transform.AFFINE, coefficients, Image.Resampling.BICUBIC, fillcolor=ground)
+    alpha = alpha.transform(size, Image.Transform.AFFINE, coefficients, Image.Resampling.BICUBIC)
+    scene = _compressed(_lit(scene, random).filter(ImageFilter.GaussianBlur(random.uniform(0, 1.5))), random)
+    return np.dstack([np.asarray(scene), np.asarray(_masked(alpha, random))]), _warped(points, matrix)
+
+
+def _to_crop(alpha: NDArray[np.uint8], roll: float, random: Generator) -> NDArray[np.float64]:
+    """The affine map `[3, 3]` from pixels of the crop to those of a rendering, that rolls it by an angle (radians)."""
+    rows, columns = np.nonzero(alpha >= 128)
+    if len(rows) == 0:
+        return np.diag([alpha.shape[1] / SIZE, alpha.shape[0] / SIZE, 1.0])
+    cosine, sine = math.cos(roll), math.sin(roll)
+    turn = np.array([[cosine, -sine], [sine, cosine]])  # of the crop's axes, in the rendering
+    places = np.stack([columns, rows], axis=1) @ turn  # along the crop's axes
+    low, high = places.min(axis=0), places.max(axis=0) + 1
+    scale = (high - low).max() / EXTENT * random.uniform(0.95, 1.05)  # rendering's pixels a pixel of the crop
+    corner = (low + high) / 2 - scale * SIZE / 2 + random.uniform(-4, 4, 2) * scale
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = turn * scale, turn @ corner
+    return matrix
+
+
+def _lit(image: Image.Image, random: Generator) -> Image.Image:
+    """Another exposure, contrast and tint, and a light that falls off across the image."""
+    levels = np.asarray(image, dtype=np.float32) / 255
+    y, x = np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j].astype(np.float32)
+    angle = random.uniform(0, 2 * math.pi)
+    falloff = 1 + random.uniform(0, 0.3) * (math.cos(angle) * x + math.sin(angle) * y)
+    gain = np.exp(random.normal(0, 0.25)) * np.exp(random.normal(0, 0.06, 3))
+    levels = levels ** np.exp(random.normal(0, 0.2)) * gain * falloff[..., None]
+    return Image.fromarray((levels.clip(0, 1) * 255 + 0.5).astype(np.uint8))
+
+
+def _compressed(image: Image.Image, random: Generator) -> Image.Image:
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=int(random.integers(40, 96)))
+    return Image.open(buffer)
+
+
+def _masked(alpha: Image.Image, random: Generator) -> Image.Image:
+    """A mask that is a little too wide or too narrow, and soft; sometimes the exact one."""
+    reach = int(random.integers(-2, 3))
+    if reach > 0:
+        alpha = alpha.filter(ImageFilter.MaxFilter(2 * reach + 1))
+    elif reach < 0:
+        alpha = alpha.filter(ImageFilter.MinFilter(-2 * reach + 1))
+    return alpha.filter(ImageFilter.GaussianBlur(random.uniform(0, 1.5)))
+
+
+def _warped(points: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The points at the pixels of the crop, of the nearest pixel of the rendering."""
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+    x, y = np.tensordot(matrix[:2, :2], np.stack([columns, rows]), axes=1) + matrix[:2, 2][:, None, None]
+    x, y = np.floor(x).astype(int), np.floor(y).astype(int)
+    inside = (x >= 0) & (x < points.shape[1]) & (y >= 0) & (y < points.shape[0])
+    result = points[y.clip(0, points.shape[0] - 1), x.clip(0, points.shape[1] - 1)]
+    result[~inside] = np.nan
+    return result
+
+
+CELLS = 14  # a side of a view, for each of which `decoded_renderings` tells a point
+
+
+def decoded_renderings(views: Sequence[ObjectViews], share: float, folder: str | Path) -> tuple[str, NDArray]:
+    """Key and array `[N]` of renderings with depth, of which `share` are made to look like photographs.
+
+    A row has `pixels` (SIZE, SIZE, 3), uint8 on white; `points` (CELLS^2, 3), float16, that its cells show, in the
+    object's frame, NaN where there is nothing; and `cropped`, whether it was made to look like a photograph.
+    """
+    files = [file for each in views for file in each.files]
+    record = np.dtype(
+        [("pixels", "u1", (SIZE, SIZE, 3)), ("points", "f2", (CELLS * CELLS, 3)), ("cropped", "?")], align=False
+    )
+
+    def blocks() -> Iterator[NDArray]:
+        for each in tracked(views, "decoding renderings"):
+            block = np.zeros(len(each), record)
+            rows = zip(each.files, depth_files(each.files), each.cameras.numpy(), strict=True)
+            for row, (file, depth, camera) in enumerate(rows):
+                with opened(file) as image:
+                    pixels = np.asarray(image.convert("RGBA"))
+                points = _points(_depth(depth), camera, each.field_of_view)
+                random = np.random.default_rng(stable_id(f"{each.name}/{file.name}"))
+                cropped = random.random() < share
+                if cropped:
+                    pixels, points = like_photograph(pixels, points, random)
+                block[row]["pixels"] = on_white(Image.fromarray(pixels))
+                block[row]["points"] = _in_cells(points)
+                block[row]["cropped"] = cropped
+            yield block
+
+    key = content_key(files, "renderings", share, SIZE, CELLS)
+    return key, cached_array(folder, key, len(files), blocks)
+
+
+def _depth(file: Path) -> NDArray[np.float32]:
+    with opened(file) as image:
+        return np.asarray(image).astype(np.float32) * np.float32(DEPTH_UNIT)
+
+
+def _points(depth: NDArray[np.float32], camera: NDArray, field_of_view: float) -> NDArray[np.float32]:
+    """The points `[H, W, 3]` in space that the pixels of a depth image show, NaN where there is nothing."""
+    height, width = depth.shape
+    slope = math.tan(field_of_view / 2)
+    x = ((np.arange(width) + 0.5) * 2 / width - 1) * slope
+    y = (1 - (np.arange(height) + 0.5) * 2 / height) * slope
+    rays = np.stack(np.broadcast_arrays(x[None], y[:, None], -1.0), axis=-1)
+    points = rays * depth[..., None] @ camera[:3, :3].T + camera[:3, 3]
+    points[depth == 0] = np.nan
+    return points.astype(np.float32)
+
+
+def _in_cells(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means `[CELLS^2, 3]` of the points `[H, W, 3]` over the cells, of every fourth pixel each way."""
+    bounds = np.linspace(0, len(points), CELLS + 1).round().astype(int)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of cells that show nothing
+        cells = [
+            np.nanmean(points[top:bottom:3, left:right:3].reshape(-1, 3), axis=0)
+            for top, bottom in itertools.pairwise(bounds)
+            for left, right in itertools.pairwise(bounds)
+        ]
+    return np.stack(cells)

@@ -1,0 +1,260 @@
+"""The matching model: an energy of the relative pose that generalises to objects it has never seen.
+
+It does not learn how certain objects look from where, as a network on pooled features does, but which local features
+are the same point of an object, and where around its upright axis that point is. See `matching_network`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from lp_framework.data.pairs import PairBatch
+from lp_framework.errors import UserError, check_settings
+from lp_framework.geometry import relative_pose
+from lp_framework.models.backbones import Backbone, EfficientNetLite0Maps, Standardise
+from lp_framework.models.matching_network import GRID, HARMONICS, SHOWN, ViewCells, ViewEncoder, Voting
+from lp_framework.models.objectives import PoseKernel
+from lp_framework.models.pair_mean import PairMean
+from lp_framework.models.pose_density import PoseDensity, from_bins
+from lp_framework.models.pose_model import FieldValue, PoseModel
+from lp_framework.registry import register
+
+POSE_SCALE = (0.3, 0.25)  # radians, scene units: about the spread of latitudes and radii
+MEAN_RADIUS = 1.6
+SMALLEST_DEVIATION, LARGEST_DEVIATION = 0.05, 3.0  # of latitude and radius, in units of POSE_SCALE
+SAME_POINT = 0.05  # scene units: standard deviation of the distance between two matching cells' points
+OVERLAPPING = 1.75  # radians: pairs farther apart in longitude see too few points together to learn matches from
+
+
+@register("model", "matching")
+class MatchingModel(PoseModel):
+    """Energy model from soft matches of local features, -log p of a density in closed form (see `PoseDensity`).
+
+    The backbone's features are maps. `cells` of a view, those that show most of the object, are matched; in training a
+    random choice of those that show it. `flips` mirrors so large a share of the training objects, `feature_noise` is in
+    units of the features' spread. The losses: the longitude's and the Gaussians' negative log-likelihood, and with the
+    weights `point_loss`, `azimuth_loss`, `match_loss` of what rendered depth tells: a cell's point in space, its
+    azimuth, its true matches.
+    """
+
+    backbone: EfficientNetLite0Maps
+    has_energy, choose_by, carries = True, "energy", ("points",)
+    pose_scale: Tensor
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        sigma: float = 1.0,
+        width: int = 128,
+        layers: int = 3,
+        heads: int = 4,
+        descriptor: int = 48,
+        polls: int = 6,
+        cells: int = 128,
+        training_cells: int = 80,
+        pairs_per_object: int = 20,
+        dropout: float = 0.05,
+        feature_noise: float = 0.15,
+        flips: float = 0.5,
+        point_loss: float = 1.0,
+        azimuth_loss: float = 2.0,
+        match_loss: float = 0.5,
+        optimizer: Literal["adam", "adamw"] = "adamw",
+        learning_rate: float = 1e-3,
+        weight_decay: float = 5e-2,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
+        check_settings(
+            "model",
+            ("sigma", sigma, sigma > 0, "above 0"),
+            ("flips", flips, 0 <= flips <= 1, "in [0, 1]"),
+        )
+        if not isinstance(backbone, EfficientNetLite0Maps):
+            raise UserError("model=matching needs maps of local features: backbone=efficientnet_lite0_maps")
+        self.sigma, self.kernel = sigma, PoseKernel("periodic", sigma)
+        self.cells, self.training_cells = cells, training_cells
+        self.pairs_per_object, self.feature_noise, self.flips = pairs_per_object, feature_noise, flips
+        self.point_loss, self.azimuth_loss, self.match_loss = point_loss, azimuth_loss, match_loss
+        self.standardise = Standardise(backbone.feature_dim)
+        self.encoder = ViewEncoder(backbone.feature_dim, width, layers, heads, descriptor, polls, dropout)
+        self.voting = Voting(width, polls)
+        self.validation_loss = PairMean()
+        self.register_buffer("pose_scale", torch.tensor(POSE_SCALE), persistent=False)
+
+    # ------------------------------------------------------------ use
+
+    def encode(self, images: Tensor) -> ViewCells:
+        """The cells of images `[I, 3, H, W]` in [-1, 1]."""
+        return self._encode(self.backbone.trunk(images))
+
+    def condition(self, reference: ViewCells, query: ViewCells) -> PoseDensity:
+        """The densities of P pairs, from the cells of either side."""
+        with torch.autocast(reference.descriptor.device.type, enabled=False):
+            logits, mean, deviation = self.voting(reference, query)
+        deviation = deviation.exp().clamp(SMALLEST_DEVIATION, LARGEST_DEVIATION)
+        return PoseDensity(from_bins(logits), mean * self.pose_scale, deviation * self.pose_scale, self.sigma)
+
+    def field(self, condition: PoseDensity, pose: Tensor) -> FieldValue:
+        """Score and energy at relative poses `[..., 3]`, of the density smoothed by the condition's `sigma`."""
+        return FieldValue(*condition.smoothed(pose))
+
+    def at_sigma(self, condition: PoseDensity, sigma: float) -> PoseDensity:
+        return replace(condition, sigma=sigma)
+
+    def modes(self, condition: PoseDensity, count: int) -> Tensor:
+        """The highest maxima of the longitude's density, at the latitude's and radius's means, `[P, count, 3]`."""
+        longitude, _ = condition.modes(count)
+        latitude, radius = condition.mean[:, None].expand(-1, count, -1).unbind(dim=-1)
+        return torch.stack([latitude, longitude, radius], dim=-1)
+
+    def _encode(self, maps: Tensor) -> ViewCells:
+        features, coverage, cells = self._foremost(maps, self.cells)
+        return self.encoder(self._standardised(features, coverage), coverage, cells)[0]
+
+    def _foremost(self, maps: Tensor, count: int, shuffle: torch.Generator | None = None) -> tuple[Tensor, ...]:
+        """Features `[I, K, F]`, coverage `[I, K, 4]` and numbers `[I, K]` of the cells that show most of the object."""
+        features, coverage = maps.split([maps.shape[-1] - 4, 4], dim=-1)
+        share = coverage.float().mean(dim=-1)
+        if shuffle is None:
+            spread = torch.arange(GRID**2, device=maps.device) * 79 % GRID**2  # among equals, from all over the image
+            order = share + 1e-4 * spread / GRID**2
+        else:
+            order = (share > SHOWN) * (1 + torch.rand(share.shape, generator=shuffle).to(share))
+        cells = order.topk(min(count, GRID**2), dim=1).indices
+        return _taken(features, cells).float(), _taken(coverage, cells).float(), cells
+
+    def _standardised(self, features: Tensor, coverage: Tensor) -> Tensor:
+        """Cells off the object are 0: they neither count for the mean and spread of the others nor say anything."""
+        shown = coverage.mean(dim=-1) > SHOWN
+        result = torch.zeros_like(features)
+        result[shown] = self.standardise(features[shown])
+        return result
+
+    # ------------------------------------------------------------ training
+
+    def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
+        assert batch.cropped is not None  # of what the model carries
+        random = self._generator()
+        maps, points, poses = self._mirrored(batch, random)
+        features, coverage, cells = self._foremost(maps, self.training_cells, random)
+        features = self._standardised(features, coverage)
+        features = features + self.feature_noise * torch.randn(features.shape, generator=random).to(features)
+        views, told_points = self.encoder(features, coverage, cells)
+        pairs = self._some_pairs(batch, random)
+        reference, query = batch.reference[pairs], batch.query[pairs]
+        density = self.condition(views[reference], views[query])
+        true = relative_pose(poses[reference], poses[query])
+        cropped = batch.cropped.to(reference.device)
+        apart = cropped[reference] | cropped[query]
+        losses = {"longitude": self._longitude_loss(density, true), "shift": self._shift_loss(density, true, apart)}
+        losses["view"] = 0.3 * self._view_loss(views, poses, cropped)
+        points = _taken(points, cells)
+        losses |= self._geometry_losses(views, told_points, points, poses, reference, query)
+        for name, value in losses.items():
+            self.log(f"train/{name}", value, batch_size=len(pairs))
+        loss = torch.stack(list(losses.values())).sum()
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(pairs))
+        return loss
+
+    def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
+        assert batch.features is not None  # its backbone is frozen
+        views = self._encode(batch.features)
+        density = self.condition(views[batch.reference], views[batch.query])
+        loss = -density.log_prob(batch.relative_poses()[:, 1])
+        self.validation_loss.update(batch.ids, loss)
+        self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
+
+    def _mirrored(self, batch: PairBatch, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Maps, points and poses of the batch's views, of some objects mirrored left to right."""
+        assert batch.features is not None and batch.points is not None
+        objects, place = batch.objects.unique(return_inverse=True)
+        flip = (torch.rand(len(objects), generator=random).to(batch.features.device) < self.flips)[place]
+        maps = torch.where(flip[:, None, None], self.backbone.mirrored(batch.features), batch.features)
+        points = batch.points.view(len(maps), GRID, GRID, 3)
+        points = torch.where(flip[:, None, None, None], points.flip(2) * points.new_tensor([-1.0, 1.0, 1.0]), points)
+        poses = batch.poses.float().to(maps.device)
+        sign = torch.where(flip, -1.0, 1.0)
+        return maps, points.flatten(1, 2).float(), torch.stack([poses[:, 0], poses[:, 1] * sign, poses[:, 2]], dim=-1)
+
+    def _some_pairs(self, batch: PairBatch, random: torch.Generator) -> Tensor:
+        """Numbers of up to `pairs_per_object` pairs of each object."""
+        order = torch.randperm(len(batch), generator=random)
+        owner = batch.objects.cpu()[batch.reference.cpu()[order]]
+        owner, by_object = owner.sort(stable=True)
+        rank = torch.arange(len(owner)) - torch.searchsorted(owner, owner)
+        return order[by_object[rank < self.pairs_per_object]].to(batch.reference.device)
+
+    @staticmethod
+    def _longitude_loss(density: PoseDensity, true: Tensor) -> Tensor:
+        return -density.log_prob(true[:, 1]).mean()
+
+    def _shift_loss(self, density: PoseDensity, true: Tensor, cropped: Tensor) -> Tensor:
+        """Of latitude and radius; the radius of a crop tells nothing."""
+        offset = (true[:, ::2] - density.mean) / self.pose_scale
+        deviation = density.deviation / self.pose_scale
+        loss = 0.5 * (offset / deviation).square() + deviation.log() + offset.abs()
+        known = torch.stack([torch.ones_like(cropped), ~cropped], dim=-1)
+        return 0.3 * (loss * known).sum() / known.sum()
+
+    def _view_loss(self, views: ViewCells, poses: Tensor, cropped: Tensor) -> Tensor:
+        scaled = (poses[:, ::2] - poses.new_tensor([0.0, MEAN_RADIUS])) / self.pose_scale
+        known = torch.stack([torch.ones_like(cropped), ~cropped], dim=-1)
+        return ((views.pose - scaled).abs() * known).sum() / known.sum()
+
+    def _geometry_losses(
+        self, views: ViewCells, told: Tensor, points: Tensor, poses: Tensor, reference: Tensor, query: Tensor
+    ) -> dict[str, Tensor]:
+        """What rendered depth teaches; `points` `[I, K, 3]` in the object's frame, NaN where nothing was met."""
+        seen = points.isfinite().all(dim=-1, keepdim=True)
+        upright = _turned(points.nan_to_num(), -poses[:, 1])  # as the camera would have it at longitude 0
+        point_loss = ((told - 3 * upright).abs() * seen).sum() / seen.sum() / 3
+        distance = upright[..., ::2].norm(dim=-1, keepdim=True)  # from the axis, near which the azimuth means little
+        phase = torch.atan2(upright[..., :1], upright[..., 2:]) * torch.arange(HARMONICS + 1, device=told.device)
+        azimuth = torch.cat([phase.cos(), phase[..., 1:].sin()], dim=-1) * (distance / 0.35).clamp(max=1)
+        azimuth_loss = ((views.azimuth - azimuth).square() * seen).mean() * seen.numel() / seen.sum()
+        apart = (poses[query, 1] - poses[reference, 1]).cos()
+        near = apart > math.cos(OVERLAPPING)
+        match_loss = self._match_loss(views, points, reference[near], query[near])
+        return {
+            "points": self.point_loss * point_loss,
+            "azimuth": self.azimuth_loss * azimuth_loss,
+            "matches": self.match_loss * match_loss,
+        }
+
+    def _match_loss(self, views: ViewCells, points: Tensor, reference: Tensor, query: Tensor) -> Tensor:
+        """Cross entropy of the matches against those of the true points; no match counts a quarter."""
+        if len(reference) == 0:
+            return points.new_zeros(())
+        ours, theirs = points[reference], points[query]
+        seen, seen_ = (each.isfinite().all(dim=-1) for each in (ours, theirs))
+        distance = torch.cdist(ours.nan_to_num(9.0), theirs.nan_to_num(-9.0))
+        same = torch.exp(-0.5 * (distance / SAME_POINT).square()) * (distance < 2.4 * SAME_POINT)
+        with torch.autocast(points.device.type, enabled=False):
+            rows, columns = self.voting.matches(views[reference], views[query])
+        loss = points.new_zeros(())
+        for log_prob, true, known in ((rows, same, seen), (columns.mT, same.mT, seen_)):
+            total = true.sum(dim=-1, keepdim=True)
+            none = (total < 1e-3).float()
+            wanted = torch.cat([true / (total + 1e-6) * (1 - none), none], dim=-1)
+            weight = torch.where(none[..., 0] > 0, 0.25, 1.0) * known
+            loss = loss - ((wanted * log_prob).sum(dim=-1) * weight).sum() / weight.sum().clamp(min=1)
+        return loss / 2
+
+
+def _taken(values: Tensor, cells: Tensor) -> Tensor:
+    """`[I, K, C]` of values `[I, GRID^2, C]` at cells `[I, K]`."""
+    return values.gather(1, cells[..., None].expand(-1, -1, values.shape[-1]))
+
+
+def _turned(points: Tensor, angle: Tensor) -> Tensor:
+    """Points `[I, K, 3]` turned about the upright axis by angles `[I]`: azimuths grow by them."""
+    cosine, sine = angle.cos()[:, None], angle.sin()[:, None]
+    x, y, z = points.unbind(dim=-1)
+    return torch.stack([x * cosine + z * sine, y, z * cosine - x * sine], dim=-1)

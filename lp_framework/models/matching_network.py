@@ -1,0 +1,189 @@
+"""Networks that match two views' local features and let the matches vote for the relative longitude.
+
+A view is a set of cells of its feature map, those that show the object. Each tells a descriptor, and its azimuth about
+the upright axis as seen from the camera; where two views show the same point of the object, the difference of its two
+azimuths is the difference of the cameras' longitudes. Matches are soft (a dual soft-max with a bin for cells that have
+no match), votes are harmonics of the azimuths, summed over all pairs of cells.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+GRID = 14  # cells a side of a view's feature map
+HARMONICS = 8  # of a cell's azimuth
+BINS = 36  # longitudes at which the network gives the log-density
+SHOWN = 0.05  # share of a cell from which on it shows the object
+MOMENTS = 6  # of a match: a cell's place in the image (2), in space (3), and one
+
+
+@dataclass(frozen=True)
+class ViewCells:
+    """K cells of each of I views, with what the votes need; indexable like a batch.
+
+    `descriptor` `[I, K, D]` of length 1; `azimuth` `[I, K, 2 H + 1]`, the cosines and sines of the multiples of a
+    cell's azimuth, shorter where it is unsure; `gates` `[I, K, G]` in [0, 1], what share of a cell's votes counts in
+    each of G polls; `moments` `[I, K, 6]`; `shown` `[I, K, 1]`, 1 where the cell shows the object and 0 elsewhere;
+    `pooled` `[I, C]` and `pose` `[I, 2]` of the whole view: its latitude and radius, in units of `POSE_SCALE`.
+    """
+
+    descriptor: Tensor
+    azimuth: Tensor
+    gates: Tensor
+    moments: Tensor
+    shown: Tensor
+    pooled: Tensor
+    pose: Tensor
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def __getitem__(self, index: Tensor) -> ViewCells:
+        return ViewCells(**{each.name: getattr(self, each.name)[index] for each in fields(self)})
+
+
+class Layer(nn.Module):
+    """A transformer's layer with the normalisation in front (Xiong et al. 2020)."""
+
+    def __init__(self, width: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.heads = heads
+        self.attention_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.queries, self.keys_values, self.out = (nn.Linear(width, n * width) for n in (1, 2, 1))
+        self.mlp = nn.Sequential(nn.Linear(width, 2 * width), nn.ReLU(), nn.Linear(2 * width, width))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, shown: Tensor) -> Tensor:
+        """`[I, K, C]` to the same; cells with `shown` `[I, K, 1]` of 0 are not attended to."""
+        batch, cells, width = x.shape
+        y = self.attention_norm(x)
+        queries = self.queries(y).view(batch, cells, self.heads, -1).transpose(1, 2)
+        keys, values = self.keys_values(y).view(batch, cells, 2, self.heads, -1).permute(2, 0, 3, 1, 4)
+        # Written out: on a CPU the fused attention has a slow backward pass.
+        logits = (queries @ keys.transpose(-1, -2)).float() / math.sqrt(width / self.heads)
+        weights = logits.masked_fill(shown.view(batch, 1, 1, cells) == 0, -1e4).softmax(dim=-1).to(values.dtype)
+        attended = (weights @ values).transpose(1, 2).reshape(batch, cells, width)
+        x = x + self.dropout(self.out(attended))
+        return x + self.dropout(self.mlp(self.mlp_norm(x)))
+
+
+def position_code(width: int) -> Tensor:
+    """Smooth sines and cosines of the cells' places in the image, `[GRID^2, width]`."""
+    places = torch.linspace(-1, 1, GRID)
+    grid = torch.stack(torch.meshgrid(places, places, indexing="ij"), dim=-1).view(-1, 2)
+    phase = grid[:, :, None] * torch.logspace(-0.3, 1.1, width // 4)
+    return 0.7 * torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(1)
+
+
+class ViewEncoder(nn.Module):
+    """Cells of a view's feature map, in the context of the others, as `ViewCells`."""
+
+    def __init__(
+        self, features: int, width: int, layers: int, heads: int, descriptor: int, polls: int, dropout: float
+    ) -> None:
+        super().__init__()
+        self.embed = nn.Linear(features + 4, width)
+        self.position = nn.Parameter(position_code(width))
+        self.layers = nn.ModuleList(Layer(width, heads, dropout) for _ in range(layers))
+        self.norm = nn.LayerNorm(width)
+        self.descriptor = nn.Linear(width, descriptor)
+        self.appearance = nn.Linear(features, descriptor, bias=False)  # what matches before anything is learned
+        self.azimuth, self.gates = nn.Linear(width, 2 * HARMONICS + 1), nn.Linear(width, polls)
+        self.points = nn.Linear(width, 3)
+        self.pose = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2))
+
+    def forward(self, features: Tensor, coverage: Tensor, cells: Tensor) -> tuple[ViewCells, Tensor]:
+        """Features `[I, K, F]`, the share of each quarter of a cell that shows the object `[I, K, 4]` and the cells'
+        numbers `[I, K]`, to `ViewCells` and the cells' points in space, `[I, K, 3]`."""
+        share = coverage.mean(dim=-1, keepdim=True)
+        shown = (share > SHOWN).float()
+        x = self.embed(torch.cat([features, coverage], dim=-1)) + self.position[cells]
+        for layer in self.layers:
+            x = layer(x, shown)
+        x = self.norm(x)
+        pooled = (x * share).sum(dim=1) / (share.sum(dim=1) + 1e-3)
+        descriptor = functional.normalize((self.descriptor(x) + self.appearance(features)).float(), dim=-1)
+        points = self.points(x).float()
+        place = torch.stack([cells % GRID, cells // GRID], dim=-1) * (2 / (GRID - 1)) - 1
+        moments = torch.cat([place, points.detach(), torch.ones_like(shown)], dim=-1)
+        gates = self.gates(x).float().sigmoid() * shown
+        view = ViewCells(
+            descriptor,
+            self.azimuth(x).float(),
+            gates,
+            moments * shown,
+            shown,
+            pooled.float(),
+            self.pose(pooled).float(),
+        )
+        return view, points
+
+
+class Voting(nn.Module):
+    """From two views' cells to the log-density of the relative longitude, and the relative latitude and radius."""
+
+    angles: Tensor
+
+    def __init__(self, width: int, polls: int) -> None:
+        super().__init__()
+        self.temperature, self.no_match = nn.Parameter(torch.tensor(2.3)), nn.Parameter(torch.tensor(3.0))
+        curves = 2 * polls + 1
+        self.read = nn.Sequential(
+            _circular(curves, 64, 5), nn.ReLU(), _circular(64, 64, 5), nn.ReLU(), _circular(64, 1, 1)
+        )
+        self.vote_scale = nn.Parameter(torch.tensor(0.1))
+        self.from_moments = nn.Sequential(nn.Linear(MOMENTS**2 + 1, 64), nn.ReLU(), nn.Linear(64, 4))
+        self.from_views = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, 2))
+        self.register_buffer(
+            "angles", torch.arange(HARMONICS + 1)[:, None] * torch.arange(BINS) * (2 * math.pi / BINS), persistent=False
+        )
+
+    def matches(self, reference: ViewCells, query: ViewCells) -> tuple[Tensor, Tensor]:
+        """Log-probabilities that cells match: of each cell of the reference over the query's and none `[P, K, K + 1]`,
+        and of each of the query over the reference's and none `[P, K + 1, K]`."""
+        alike = reference.descriptor @ query.descriptor.transpose(1, 2) * self.temperature.exp()
+        alike = alike.masked_fill(reference.shown == 0, -30.0).masked_fill(query.shown.transpose(1, 2) == 0, -30.0)
+        none = self.no_match.expand(len(alike), alike.shape[1], 1)
+        rows = torch.cat([alike, none], dim=2).log_softmax(dim=2)
+        none = self.no_match.expand(len(alike), 1, alike.shape[2])
+        return rows, torch.cat([alike, none], dim=1).log_softmax(dim=1)
+
+    def forward(self, reference: ViewCells, query: ViewCells) -> tuple[Tensor, Tensor, Tensor]:
+        """Logits `[P, BINS]`; mean and log-deviation `[P, 2]` of latitude and radius, in units of `POSE_SCALE`."""
+        rows, columns = self.matches(reference, query)
+        weight = (0.5 * (rows[:, :, :-1] + columns[:, :-1])).exp()  # [P, K, K]
+        count = weight.sum(dim=(1, 2))[:, None]
+        votes = self._votes(reference, query, weight)
+        spread = votes.std(dim=-1, keepdim=True)
+        amount = (count + 0.1).log()[..., None].expand(-1, -1, BINS)
+        curves = torch.cat([0.3 * votes, votes / (spread + 0.05), 0.5 * amount], dim=1)
+        logits = self.read(curves).squeeze(1) + self.vote_scale * votes.mean(dim=1)
+        moments = (reference.moments.transpose(1, 2) @ (weight @ query.moments)).flatten(1) / (count + 0.1)
+        told = self.from_moments(torch.cat([moments, (count + 0.1).log()], dim=1))
+        forth = self.from_views(torch.cat([query.pooled, reference.pooled], dim=-1))
+        back = self.from_views(torch.cat([reference.pooled, query.pooled], dim=-1))
+        return logits, told[:, :2] + query.pose - reference.pose + forth - back, told[:, 2:]
+
+    def _votes(self, reference: ViewCells, query: ViewCells, weight: Tensor) -> Tensor:
+        """Votes `[P, polls, BINS]` for each longitude: sum over matches of cos(k (azimuth - azimuth' - longitude))."""
+        pairs, cells, polls = reference.gates.shape
+        ours = reference.gates[..., None] * reference.azimuth[:, :, None]
+        theirs = (query.gates[..., None] * query.azimuth[:, :, None]).flatten(2)
+        theirs = (weight @ theirs).view(pairs, cells, polls, -1)
+        cosine, sine = ours.split([HARMONICS + 1, HARMONICS], dim=-1)
+        cosine_, sine_ = theirs.split([HARMONICS + 1, HARMONICS], dim=-1)
+        zero = sine.new_zeros(*sine.shape[:-1], 1)
+        sine, sine_ = torch.cat([zero, sine], dim=-1), torch.cat([zero, sine_], dim=-1)
+        real = (cosine * cosine_ + sine * sine_).sum(dim=1)
+        imaginary = (sine * cosine_ - cosine * sine_).sum(dim=1)
+        votes = real @ self.angles.cos() + imaginary @ self.angles.sin()
+        return votes - votes.mean(dim=-1, keepdim=True)
+
+
+def _circular(inputs: int, outputs: int, size: int) -> nn.Conv1d:
+    return nn.Conv1d(inputs, outputs, size, padding=size // 2, padding_mode="circular")

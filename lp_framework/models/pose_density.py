@@ -1,0 +1,103 @@
+"""Probability densities of the relative pose in closed form, and the paper's smoothing of them.
+
+The density is a product: over the longitude the exponential of a Fourier series (smooth, periodic, with any number of
+modes), normalised on a grid; over latitude and radius a Gaussian each. The score that denoising score matching aims at
+is that of the density convolved with the noise (paper, Proposition 1 in "Theoretical Justification"). Here it needs no
+training: the convolution with a Gaussian multiplies the k-th harmonic of a periodic density by exp(-k^2 sigma^2 / 2),
+and adds sigma^2 to the variance of a Gaussian.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+GRID = 144  # longitudes at which densities are normalised, 2.5 degrees apart
+
+
+@dataclass(frozen=True)
+class PoseDensity:
+    """Densities of P relative poses: `logits` `[P, GRID]`, log-densities at longitudes 0, 2 pi / GRID, ..., up to a
+    constant; `mean` and `deviation` `[P, 2]` of latitude (radians) and radius (scene units). `sigma` (radians and scene
+    units) is the standard deviation of the noise that `smoothed` convolves them with.
+
+    It can be indexed along the pairs, and given further dimensions there, as conditions of a model can.
+    """
+
+    logits: Tensor
+    mean: Tensor
+    deviation: Tensor
+    sigma: float = 1.0
+
+    def __getitem__(self, index: Any) -> PoseDensity:
+        return PoseDensity(self.logits[index], self.mean[index], self.deviation[index], self.sigma)
+
+    @property
+    def probabilities(self) -> Tensor:
+        """Of the longitudes of the grid, `[P, GRID]`."""
+        return self.logits.softmax(dim=-1)
+
+    def smoothed(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Score `[..., 3]` and energy `[...]` at poses `[..., 3]` of the density convolved with N(0, sigma^2).
+
+        The energy is -log of the density, with its normalisation: energies of different pairs compare.
+        """
+        order = torch.arange(GRID // 2, device=pose.device)
+        harmonics = torch.fft.rfft(self.probabilities)[..., :-1] / (2 * math.pi)
+        weight = torch.where(order == 0, 1.0, 2.0) * torch.exp(-0.5 * (order * self.sigma).square())
+        phase = pose[..., 1:2] * order
+        real, imaginary = weight * harmonics.real, weight * harmonics.imag
+        # Rounding can take a density of almost nothing below zero.
+        density = (real * phase.cos() - imaginary * phase.sin()).sum(dim=-1).clamp(min=1e-7)
+        slope = (-order * (real * phase.sin() + imaginary * phase.cos())).sum(dim=-1)
+        variance = self.deviation.square() + self.sigma**2
+        offset = pose[..., ::2] - self.mean
+        score = -offset / variance
+        energy = -density.log() + 0.5 * (offset.square() / variance + (2 * math.pi * variance).log()).sum(dim=-1)
+        return torch.stack([score[..., 0], slope / density, score[..., 1]], dim=-1), energy
+
+    def log_prob(self, longitude: Tensor) -> Tensor:
+        """Log-density `[P]` (per radian) at a longitude `[P]` each, between the grid's by their Fourier series."""
+        order = torch.arange(GRID // 2, device=longitude.device)
+        harmonics = torch.fft.rfft(self.logits)[..., :-1] / GRID
+        weight = torch.where(order == 0, 1.0, 2.0)
+        phase = longitude[..., None] * order
+        value = (weight * (harmonics.real * phase.cos() - harmonics.imag * phase.sin())).sum(dim=-1)
+        return value - self.logits.logsumexp(dim=-1) - math.log(2 * math.pi / GRID)
+
+    def modes(self, count: int) -> tuple[Tensor, Tensor]:
+        """The `count` highest local maxima: longitudes `[P, count]` and the probability of lying within 30 degrees.
+
+        Where there are fewer, the highest again. The place between the grid's longitudes is that of a parabola's top.
+        """
+        behind, ahead = self.logits.roll(1, -1), self.logits.roll(-1, -1)
+        top = (self.logits > behind) & (self.logits >= ahead)
+        heights, places = torch.where(top, self.logits, -torch.inf).topk(count, dim=-1)
+        places = torch.where(heights.isfinite(), places, places[..., :1])
+        left, middle, right = (each.gather(-1, places) for each in (behind, self.logits, ahead))
+        shift = 0.5 * (left - right) / (left - 2 * middle + right).clamp(max=-1e-6)
+        longitudes = torch.remainder((places + shift.clamp(-0.5, 0.5)) * (2 * math.pi / GRID), 2 * math.pi)
+        return longitudes, self.probability_near(places)
+
+    def probability_near(self, places: Tensor, degrees: float = 30.0) -> Tensor:
+        """Of longitudes within so many degrees of places `[..., M]` of the grid."""
+        reach = round(degrees / 360 * GRID)
+        offsets = torch.arange(-reach, reach + 1, device=places.device)
+        weights = torch.ones(len(offsets), device=places.device)
+        weights[0] = weights[-1] = 0.5
+        near = (places[..., None] + offsets) % GRID
+        mass = self.probabilities[..., None, :].expand(*places.shape, GRID).gather(-1, near)
+        return (mass * weights).sum(dim=-1)
+
+
+def from_bins(logits: Tensor) -> Tensor:
+    """Log-densities on the grid `[..., GRID]` of a Fourier series given at fewer longitudes `[..., bins]`, an even
+    number that divides `GRID`."""
+    bins = logits.shape[-1]
+    harmonics = torch.fft.rfft(logits.float())
+    harmonics = torch.cat([harmonics[..., :-1], harmonics[..., -1:] / 2], dim=-1)  # half of it is of order -bins / 2
+    return torch.fft.irfft(harmonics * (GRID / bins), n=GRID)
