@@ -50,7 +50,7 @@ def test_the_weights_are_small_and_say_where_they_come_from():
     files = [file for file in SHIPPED.rglob("*") if file.is_file()]
     assert sum(file.stat().st_size for file in files if file.suffix == ".safetensors") < 10e6
     assert (SHIPPED / "tiny" / "model.safetensors").stat().st_size < 8e6
-    for name in ("tiny", "score"):
+    for name in ("tiny", "score", "general"):
         assert {"config.yaml", "metrics.csv", "training.png"} <= {file.name for file in (SHIPPED / name).iterdir()}
 
 

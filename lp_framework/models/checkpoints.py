@@ -29,6 +29,7 @@ from lp_framework.models.trained_module import RECIPE, TrainedModule
 FOLDER = "checkpoints"
 LATEST = "latest"
 LAST, BEST = "last.ckpt", "best.ckpt"
+TRAINED_ON = {"general": "1,840 procedural objects"}
 SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
 CONFIG, WEIGHTS = "model.json", "model.safetensors"
 ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
@@ -150,7 +151,8 @@ def latest_checkpoint(runs: str | Path = "runs/train") -> Path:
 def describe(checkpoint: Path) -> str:
     """A checkpoint in words, for the terminal."""
     if checkpoint.is_relative_to(SHIPPED):
-        return f"{checkpoint.parent.name}, which ships with lp_framework (trained on the twelve embedded objects)"
+        name = checkpoint.parent.name
+        return f"{name}, which ships with lp_framework (trained on {TRAINED_ON.get(name, 'the twelve embedded objects')})"
     return str(checkpoint)
 
 
