@@ -202,18 +202,13 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
     assert here.status == 0, here.err
     chosen()
     gathered_on, drawn_on = [], []
-    result = Evaluation.result
-
-    def gathered(evaluation: Evaluation) -> dict[str, Any]:
-        gathered_on.extend({each.device for each in (*evaluation.metrics.pair, *evaluation.metrics.cost)})
-        return result(evaluation)
 
     def save(folder: Path, evaluation: Evaluation, data: PairData, result: dict[str, Any]) -> list[Path]:
+        gathered_on.extend(each.device for each in (*evaluation.metrics.pair, *evaluation.metrics.cost))
         drawn_on.append(next(evaluation.parameters()).device)
         return save_pictures(folder, evaluation, data, result)
 
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", save)
-    monkeypatch.setattr(Evaluation, "result", gathered)
     there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver], "pictures=true")
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
