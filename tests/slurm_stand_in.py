@@ -9,7 +9,7 @@ from pathlib import Path
 ARRAY = 4200  # the array's number
 # Starts the script for every task of the array, as Slurm would on a node, and returns at once.
 SBATCH = f"""
-    import os, re, subprocess, sys
+    import os, pathlib, re, subprocess, sys
 
     script = sys.argv[-1]
     first, last = map(int, re.search(r"^#SBATCH --array=(\\d+)-(\\d+)%", open(script).read(), re.MULTILINE).groups())
@@ -18,7 +18,9 @@ SBATCH = f"""
         place = {{"NTASKS": 1, "JOB_NUM_NODES": 1, "NNODES": 1, "NODEID": 0, "PROCID": 0, "LOCALID": 0}}
         slurm = {{f"SLURM_{{key}}": str(value) for key, value in (job | place).items()}}
         environment = os.environ | slurm | {{"SLURM_JOB_NODELIST": "node0", "SLURMD_NODENAME": "node0"}}
-        subprocess.Popen(["bash", script], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        printed = pathlib.Path(__file__).with_name(f"job_{{task}}.txt")
+        ran = subprocess.Popen(["bash", script], env=environment, stdout=printed.open("w"), stderr=subprocess.STDOUT)
+        printed.with_suffix(".pid").write_text(str(ran.pid))
     print("Submitted batch job {ARRAY}")
 """
 SRUN = """
@@ -29,10 +31,18 @@ SRUN = """
         command = command[2 if command[0] in ("--output", "--error") else 1 :]
     os.execvp(command[0], command)
 """
+# A job that has died is not waited for.
 SACCT = f"""
+    import os, pathlib
+
     print("JobID|State|NodeList")
-    for task in range(8):
-        print(f"{ARRAY}_{{task}}|RUNNING|node0")
+    for file in pathlib.Path(__file__).parent.glob("job_*.pid"):
+        try:
+            os.kill(int(file.read_text()), 0)
+            state = "RUNNING"
+        except ProcessLookupError:
+            state = "COMPLETED"
+        print(f"{ARRAY}_{{file.stem.removeprefix('job_')}}|{{state}}|node0")
 """
 
 
