@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import painted_cube
@@ -44,7 +45,7 @@ def box(tmp_path_factory):
 
 def test_points_are_those_that_the_cells_show(box, tmp_path):
     """The box's colours tell its points: a cell's mean colour is that of its mean point, but for rims and edges."""
-    _, views = decoded_renderings([read_views(box, "box", "train")], 0.0, tmp_path)
+    _, views = decoded_renderings([read_views(box, "box", "train")], 0.0, SIZE, tmp_path)
     assert not views["cropped"].any()
     pixels = np.array(views["pixels"], dtype=np.float64)
     bounds = np.linspace(0, SIZE, CELLS + 1).round().astype(int)
@@ -63,22 +64,37 @@ def test_points_are_those_that_the_cells_show(box, tmp_path):
 
 
 def test_the_share_of_photographs_is_drawn_by_name_and_keeps_the_points_on_the_box(box, tmp_path):
-    _, views = decoded_renderings([read_views(box, "box", "train")], 1.0, tmp_path)
+    _, views = decoded_renderings([read_views(box, "box", "train")], 1.0, SIZE, tmp_path)
     assert views["cropped"].all()
     points = views["points"].astype(np.float64)
     seen = np.isfinite(points).all(axis=-1)
     assert seen.mean() > 0.2
     half = np.array(painted_cube.SIDES) / 2
     assert (np.abs(points[seen]) <= half + 0.01).all()
-    _, again = decoded_renderings([read_views(box, "box", "train")], 1.0, tmp_path / "other")
+    _, again = decoded_renderings([read_views(box, "box", "train")], 1.0, SIZE, tmp_path / "other")
     np.testing.assert_array_equal(views["pixels"], again["pixels"])
+
+
+def test_renderings_of_other_cameras_depths_and_sizes_are_decoded_anew(box, tmp_path):
+    views = read_views(box, "box", "train")
+    key, _ = decoded_renderings([views], 0.5, SIZE, tmp_path)
+    small, pixels = decoded_renderings([views], 0.5, 64, tmp_path)
+    assert pixels["pixels"].shape == (4, 64, 64, 3)
+    nearer, _ = decoded_renderings([replace(views, cameras=views.cameras * 1.1)], 0.5, SIZE, tmp_path)
+    wider, _ = decoded_renderings([replace(views, field_of_view=0.8)], 0.5, SIZE, tmp_path)
+    file = box / "box" / "train" / "depth" / "001.png"
+    kept = file.read_bytes()
+    Image.fromarray(np.full((SIZE, SIZE), 9_000, np.uint16)).save(file)
+    deeper, _ = decoded_renderings([views], 0.5, SIZE, tmp_path)
+    file.write_bytes(kept)
+    assert len({key, small, nearer, wider, deeper}) == 5
 
 
 def test_views_without_depth_are_named(box, tmp_path):
     views = read_views(box, "box", "train")
     (box / "box" / "train" / "depth" / "002.png").rename(tmp_path / "002.png")
     with pytest.raises(UserError, match=r"002\.png: there is no such file; views rendered with data\.depth=true have"):
-        decoded_renderings([views], 0.5, tmp_path)
+        decoded_renderings([views], 0.5, SIZE, tmp_path)
     (tmp_path / "002.png").rename(box / "box" / "train" / "depth" / "002.png")
 
 

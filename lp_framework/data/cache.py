@@ -102,13 +102,16 @@ def content_key(files: Iterable[Path], *facts: object) -> str:
 def decoded_views(files: Sequence[Path], size: int, folder: str | Path) -> tuple[str, NDArray]:
     """Key and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized; decoded once.
     `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
-
-    def decode(image: Image.Image) -> NDArray:
-        white = Image.fromarray(on_white(image.convert("RGBA")))
-        return np.asarray(white.resize((size, size), Image.Resampling.BOX))
-
     key = content_key(files, "views", size)
-    return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))
+    return key, cached_array(
+        folder, key, len(files), lambda: _decoded(files, lambda image: pixels_on_white(image, size), "decoding views")
+    )
+
+
+def pixels_on_white(image: Image.Image, size: int) -> NDArray[np.uint8]:
+    """Pixels `[size, size, 3]` of a view, composed over white and resized."""
+    white = Image.fromarray(on_white(image.convert("RGBA")))
+    return np.asarray(white.resize((size, size), Image.Resampling.BOX))
 
 
 def decoded_alpha(files: Sequence[Path], size: int, folder: str | Path, views: str) -> NDArray:
@@ -135,11 +138,15 @@ def decoded_depths(files: Sequence[Path], size: int, folder: str | Path) -> NDAr
     depths = depth_files(files)
 
     def decode(image: Image.Image) -> NDArray:
-        levels = np.asarray(image.resize((size, size), Image.Resampling.NEAREST))
-        return levels.astype(np.float32) * np.float32(DEPTH_UNIT)
+        return scene_depth(image.resize((size, size), Image.Resampling.NEAREST))
 
     key = content_key(depths, "depths", size)
     return cached_array(folder, key, len(depths), lambda: _decoded(depths, decode, "decoding depths"))
+
+
+def scene_depth(image: Image.Image) -> NDArray[np.float32]:
+    """Depths `[H, W]` in scene units of an image of their levels."""
+    return np.asarray(image).astype(np.float32) * np.float32(DEPTH_UNIT)
 
 
 def _decoded(files: Sequence[Path], decode: Callable[[Image.Image], NDArray], description: str) -> Iterator[NDArray]:

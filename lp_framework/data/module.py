@@ -178,7 +178,7 @@ class PairDataModule(LightningDataModule):
         # Training and validation views share one array, so that another way to divide them decodes nothing anew.
         files = [file for views in self._on_disk(split) for file in views.files]
         if _folder(split) == "train" and (self.photographs or "points" in self._carried):
-            key, views = decoded_renderings(self._on_disk(split), self.photographs, self.cache)
+            key, views = decoded_renderings(self._on_disk(split), self.photographs, self.image_size, self.cache)
             images = views["pixels"]
             arrays = {"points": views["points"], "cropped": views["cropped"]}
         else:

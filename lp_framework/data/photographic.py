@@ -18,12 +18,13 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
-from lp_framework.data.cache import cached_array, content_key, depth_files, tracked
-from lp_framework.data.photographs import EXTENT, SIZE, on_white, opened
-from lp_framework.data.views import DEPTH_UNIT, ObjectViews
+from lp_framework.data.cache import cached_array, content_key, depth_files, pixels_on_white, scene_depth, tracked
+from lp_framework.data.photographs import EXTENT, SIZE, opened
+from lp_framework.data.views import ObjectViews
 from lp_framework.keyed_random import stable_id
 
 ROLL_DEGREES = 10.0  # at most, to either side
+CELLS = 14  # a side of a view, for each of which `decoded_renderings` tells a point
 
 
 def like_photograph(
@@ -98,44 +99,37 @@ def _warped(points: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray
     return result
 
 
-CELLS = 14  # a side of a view, for each of which `decoded_renderings` tells a point
-
-
-def decoded_renderings(views: Sequence[ObjectViews], share: float, folder: str | Path) -> tuple[str, NDArray]:
+def decoded_renderings(
+    views: Sequence[ObjectViews], share: float, size: int, folder: str | Path
+) -> tuple[str, NDArray]:
     """Key and array `[N]` of renderings with depth, of which `share` are made to look like photographs.
 
-    A row has `pixels` (SIZE, SIZE, 3), uint8 on white; `points` (CELLS^2, 3), float16, that its cells show, in the
+    A row has `pixels` (size, size, 3), uint8 on white; `points` (CELLS^2, 3), float16, that its cells show, in the
     object's frame, NaN where there is nothing; and `cropped`, whether it was made to look like a photograph.
     """
     files = [file for each in views for file in each.files]
-    record = np.dtype(
-        [("pixels", "u1", (SIZE, SIZE, 3)), ("points", "f2", (CELLS * CELLS, 3)), ("cropped", "?")], align=False
-    )
+    record = np.dtype([("pixels", "u1", (size, size, 3)), ("points", "f2", (CELLS * CELLS, 3)), ("cropped", "?")])
 
     def blocks() -> Iterator[NDArray]:
         for each in tracked(views, "decoding renderings"):
             block = np.zeros(len(each), record)
             rows = zip(each.files, depth_files(each.files), each.cameras.numpy(), strict=True)
             for row, (file, depth, camera) in enumerate(rows):
-                with opened(file) as image:
+                with opened(file) as image, opened(depth) as levels:
                     pixels = np.asarray(image.convert("RGBA"))
-                points = _points(_depth(depth), camera, each.field_of_view)
+                    points = _points(scene_depth(levels), camera, each.field_of_view)
                 random = np.random.default_rng(stable_id(f"{each.name}/{file.name}"))
                 cropped = random.random() < share
                 if cropped:
                     pixels, points = like_photograph(pixels, points, random)
-                block[row]["pixels"] = on_white(Image.fromarray(pixels))
+                block[row]["pixels"] = pixels_on_white(Image.fromarray(pixels), size)
                 block[row]["points"] = _in_cells(points)
                 block[row]["cropped"] = cropped
             yield block
 
-    key = content_key(files, "renderings", share, SIZE, CELLS)
+    seen_from = [(each.name, each.cameras.tolist(), each.field_of_view) for each in views]
+    key = content_key([*files, *depth_files(files)], "renderings", share, size, CELLS, seen_from)
     return key, cached_array(folder, key, len(files), blocks)
-
-
-def _depth(file: Path) -> NDArray[np.float32]:
-    with opened(file) as image:
-        return np.asarray(image).astype(np.float32) * np.float32(DEPTH_UNIT)
 
 
 def _points(depth: NDArray[np.float32], camera: NDArray, field_of_view: float) -> NDArray[np.float32]:
@@ -151,7 +145,7 @@ def _points(depth: NDArray[np.float32], camera: NDArray, field_of_view: float) -
 
 
 def _in_cells(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means `[CELLS^2, 3]` of the points `[H, W, 3]` over the cells, of every fourth pixel each way."""
+    """Means `[CELLS^2, 3]` of the points `[H, W, 3]` over the cells, of every third pixel each way."""
     bounds = np.linspace(0, len(points), CELLS + 1).round().astype(int)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of cells that show nothing
