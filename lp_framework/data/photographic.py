@@ -24,7 +24,7 @@ from lp_framework.data.views import ObjectViews
 from lp_framework.keyed_random import stable_id
 
 ROLL_DEGREES = 10.0  # at most, to either side
-CELLS = 14  # a side of a view, for each of which `decoded_renderings` tells a point
+CELLS = 14  # a side of a view, of which each tells its features and a point in space
 
 
 def like_photograph(

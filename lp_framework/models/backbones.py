@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.nn import functional
 
+from lp_framework.data.photographic import CELLS
 from lp_framework.registry import register
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -157,11 +158,11 @@ class EfficientNetLite0Maps(Backbone):
     cell's neighbourhood of four), and the share of each quarter that shows the object, which is what is not white.
     """
 
-    GRID, CHANNELS = 14, (40, 112, 192)  # cells a side; of the features at strides 8, 16, 32
+    CHANNELS = (40, 112, 192)  # of the features at strides 8, 16, 32
 
     def __init__(self) -> None:
         super().__init__()
-        self.image_size, self.frozen = 16 * self.GRID, True
+        self.image_size, self.frozen = 16 * CELLS, True
         fine, middle, coarse = self.CHANNELS
         self.feature_dim = 4 * fine + middle + coarse
         self.trunk_dim = self.feature_dim + 4
@@ -179,7 +180,7 @@ class EfficientNetLite0Maps(Backbone):
         return self.stem
 
     def trunk_features(self, images: Tensor) -> Tensor:
-        """`[I, GRID^2, trunk_dim]`, float16: 0.2 MB an image."""
+        """`[I, CELLS^2, trunk_dim]`, float16: 0.2 MB an image."""
         maps, x = [], images
         for number, block in enumerate(self.stem):
             x = block(x)
@@ -194,12 +195,12 @@ class EfficientNetLite0Maps(Backbone):
         return torch.cat(cells, dim=1).flatten(2).transpose(1, 2).half()
 
     def mirrored(self, maps: Tensor) -> Tensor:
-        """The maps `[I, GRID^2, trunk_dim]` turned left to right, quarters of the cells included."""
+        """The maps `[I, CELLS^2, trunk_dim]` turned left to right, quarters of the cells included."""
         fine = torch.arange(4 * self.CHANNELS[0]).view(2, 2, -1).flip(1).flatten()
         others = torch.arange(len(fine), self.feature_dim)
         coverage = self.feature_dim + torch.tensor([1, 0, 3, 2])
         channels = torch.cat([fine, others, coverage]).to(maps.device)
-        return maps.view(len(maps), self.GRID, self.GRID, -1).flip(2)[..., channels].flatten(1, 2)
+        return maps.view(len(maps), CELLS, CELLS, -1).flip(2)[..., channels].flatten(1, 2)
 
 
 def quarters(maps: Tensor) -> Tensor:

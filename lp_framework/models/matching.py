@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from lp_framework.data.pairs import PairBatch
+from lp_framework.data.photographic import CELLS
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import relative_pose
 from lp_framework.models.backbones import Backbone, EfficientNetLite0Maps, Standardise
-from lp_framework.models.matching_network import GRID, HARMONICS, SHOWN, ViewCells, ViewEncoder, Voting
+from lp_framework.models.matching_network import HARMONICS, SHOWN, ViewCells, ViewEncoder, Voting
 from lp_framework.models.objectives import PoseKernel
 from lp_framework.models.pair_mean import PairMean
 from lp_framework.models.pose_density import PoseDensity, from_bins
@@ -25,6 +26,8 @@ from lp_framework.models.pose_model import FieldValue, PoseModel
 from lp_framework.registry import register
 
 POSE_SCALE = (0.3, 0.25)  # radians, scene units: about the spread of latitudes and radii
+POINT_SCALE = 3.0  # of the cells' points in space, whose coordinates lie within half a scene unit
+NEAR_AXIS = 0.35  # scene units: distance from the upright axis within which a point's azimuth means little
 MEAN_RADIUS = 1.6
 SMALLEST_DEVIATION, LARGEST_DEVIATION = 0.05, 3.0  # of latitude and radius, in units of POSE_SCALE
 SAME_POINT = 0.05  # scene units: standard deviation of the distance between two matching cells' points
@@ -123,11 +126,11 @@ class MatchingModel(PoseModel):
         features, coverage = maps.split([maps.shape[-1] - 4, 4], dim=-1)
         share = coverage.float().mean(dim=-1)
         if shuffle is None:
-            spread = torch.arange(GRID**2, device=maps.device) * 79 % GRID**2  # among equals, from all over the image
-            order = share + 1e-4 * spread / GRID**2
+            spread = torch.arange(CELLS**2, device=maps.device) * 79 % CELLS**2  # among equals, from all over the image
+            order = share + 1e-4 * spread / CELLS**2
         else:
             order = (share > SHOWN) * (1 + torch.rand(share.shape, generator=shuffle).to(share))
-        cells = order.topk(min(count, GRID**2), dim=1).indices
+        cells = order.topk(min(count, CELLS**2), dim=1).indices
         return _taken(features, cells).float(), _taken(coverage, cells).float(), cells
 
     def _standardised(self, features: Tensor, coverage: Tensor) -> Tensor:
@@ -152,11 +155,12 @@ class MatchingModel(PoseModel):
         density = self.condition(views[reference], views[query])
         true = relative_pose(poses[reference], poses[query])
         cropped = batch.cropped.to(reference.device)
-        apart = cropped[reference] | cropped[query]
-        losses = {"longitude": self._longitude_loss(density, true), "shift": self._shift_loss(density, true, apart)}
-        losses["view"] = 0.3 * self._view_loss(views, poses, cropped)
-        points = _taken(points, cells)
-        losses |= self._geometry_losses(views, told_points, points, poses, reference, query)
+        losses = {
+            "longitude": -density.log_prob(true[:, 1]).mean(),
+            "shift": 0.3 * self._shift_loss(density, true, cropped[reference] | cropped[query]),
+            "view": 0.3 * self._view_loss(views, poses, cropped),
+            **self._geometry_losses(views, told_points, _taken(points, cells), poses, reference, query),
+        }
         for name, value in losses.items():
             self.log(f"train/{name}", value, batch_size=len(pairs))
         loss = torch.stack(list(losses.values())).sum()
@@ -177,7 +181,7 @@ class MatchingModel(PoseModel):
         objects, place = batch.objects.unique(return_inverse=True)
         flip = (torch.rand(len(objects), generator=random).to(batch.features.device) < self.flips)[place]
         maps = torch.where(flip[:, None, None], self.backbone.mirrored(batch.features), batch.features)
-        points = batch.points.view(len(maps), GRID, GRID, 3)
+        points = batch.points.view(len(maps), CELLS, CELLS, 3)
         points = torch.where(flip[:, None, None, None], points.flip(2) * points.new_tensor([-1.0, 1.0, 1.0]), points)
         poses = batch.poses.float().to(maps.device)
         sign = torch.where(flip, -1.0, 1.0)
@@ -191,22 +195,16 @@ class MatchingModel(PoseModel):
         rank = torch.arange(len(owner)) - torch.searchsorted(owner, owner)
         return order[by_object[rank < self.pairs_per_object]].to(batch.reference.device)
 
-    @staticmethod
-    def _longitude_loss(density: PoseDensity, true: Tensor) -> Tensor:
-        return -density.log_prob(true[:, 1]).mean()
-
     def _shift_loss(self, density: PoseDensity, true: Tensor, cropped: Tensor) -> Tensor:
-        """Of latitude and radius; the radius of a crop tells nothing."""
+        """Negative log-likelihood of latitude and radius under their Gaussians, and the means' absolute error."""
         offset = (true[:, ::2] - density.mean) / self.pose_scale
         deviation = density.deviation / self.pose_scale
         loss = 0.5 * (offset / deviation).square() + deviation.log() + offset.abs()
-        known = torch.stack([torch.ones_like(cropped), ~cropped], dim=-1)
-        return 0.3 * (loss * known).sum() / known.sum()
+        return _mean_without_crops_radii(loss, cropped)
 
     def _view_loss(self, views: ViewCells, poses: Tensor, cropped: Tensor) -> Tensor:
         scaled = (poses[:, ::2] - poses.new_tensor([0.0, MEAN_RADIUS])) / self.pose_scale
-        known = torch.stack([torch.ones_like(cropped), ~cropped], dim=-1)
-        return ((views.pose - scaled).abs() * known).sum() / known.sum()
+        return _mean_without_crops_radii((views.pose - scaled).abs(), cropped)
 
     def _geometry_losses(
         self, views: ViewCells, told: Tensor, points: Tensor, poses: Tensor, reference: Tensor, query: Tensor
@@ -214,13 +212,12 @@ class MatchingModel(PoseModel):
         """What rendered depth teaches; `points` `[I, K, 3]` in the object's frame, NaN where nothing was met."""
         seen = points.isfinite().all(dim=-1, keepdim=True)
         upright = _turned(points.nan_to_num(), -poses[:, 1])  # as the camera would have it at longitude 0
-        point_loss = ((told - 3 * upright).abs() * seen).sum() / seen.sum() / 3
-        distance = upright[..., ::2].norm(dim=-1, keepdim=True)  # from the axis, near which the azimuth means little
+        point_loss = ((told - POINT_SCALE * upright).abs() * seen).sum() / seen.sum() / 3
+        distance = upright[..., ::2].norm(dim=-1, keepdim=True)
         phase = torch.atan2(upright[..., :1], upright[..., 2:]) * torch.arange(HARMONICS + 1, device=told.device)
-        azimuth = torch.cat([phase.cos(), phase[..., 1:].sin()], dim=-1) * (distance / 0.35).clamp(max=1)
+        azimuth = torch.cat([phase.cos(), phase[..., 1:].sin()], dim=-1) * (distance / NEAR_AXIS).clamp(max=1)
         azimuth_loss = ((views.azimuth - azimuth).square() * seen).mean() * seen.numel() / seen.sum()
-        apart = (poses[query, 1] - poses[reference, 1]).cos()
-        near = apart > math.cos(OVERLAPPING)
+        near = (poses[query, 1] - poses[reference, 1]).cos() > math.cos(OVERLAPPING)
         match_loss = self._match_loss(views, points, reference[near], query[near])
         return {
             "points": self.point_loss * point_loss,
@@ -248,8 +245,14 @@ class MatchingModel(PoseModel):
         return loss / 2
 
 
+def _mean_without_crops_radii(losses: Tensor, cropped: Tensor) -> Tensor:
+    """The mean of losses `[B, 2]` of latitude and radius, but for the radii of crops `[B]`, which tell nothing."""
+    known = torch.stack([torch.ones_like(cropped), ~cropped], dim=-1)
+    return (losses * known).sum() / known.sum()
+
+
 def _taken(values: Tensor, cells: Tensor) -> Tensor:
-    """`[I, K, C]` of values `[I, GRID^2, C]` at cells `[I, K]`."""
+    """`[I, K, C]` of values `[I, CELLS^2, C]` at cells `[I, K]`."""
     return values.gather(1, cells[..., None].expand(-1, -1, values.shape[-1]))
 
 

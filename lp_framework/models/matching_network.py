@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-GRID = 14  # cells a side of a view's feature map
+from lp_framework.data.photographic import CELLS
+
 HARMONICS = 8  # of a cell's azimuth
 BINS = 36  # longitudes at which the network gives the log-density
 SHOWN = 0.05  # share of a cell from which on it shows the object
@@ -73,8 +74,8 @@ class Layer(nn.Module):
 
 
 def position_code(width: int) -> Tensor:
-    """Smooth sines and cosines of the cells' places in the image, `[GRID^2, width]`."""
-    places = torch.linspace(-1, 1, GRID)
+    """Smooth sines and cosines of the cells' places in the image, `[CELLS^2, width]`."""
+    places = torch.linspace(-1, 1, CELLS)
     grid = torch.stack(torch.meshgrid(places, places, indexing="ij"), dim=-1).view(-1, 2)
     phase = grid[:, :, None] * torch.logspace(-0.3, 1.1, width // 4)
     return 0.7 * torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(1)
@@ -109,7 +110,7 @@ class ViewEncoder(nn.Module):
         pooled = (x * share).sum(dim=1) / (share.sum(dim=1) + 1e-3)
         descriptor = functional.normalize((self.descriptor(x) + self.appearance(features)).float(), dim=-1)
         points = self.points(x).float()
-        place = torch.stack([cells % GRID, cells // GRID], dim=-1) * (2 / (GRID - 1)) - 1
+        place = torch.stack([cells % CELLS, cells // CELLS], dim=-1) * (2 / (CELLS - 1)) - 1
         moments = torch.cat([place, points.detach(), torch.ones_like(shown)], dim=-1)
         gates = self.gates(x).float().sigmoid() * shown
         view = ViewCells(
