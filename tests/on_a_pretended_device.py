@@ -31,12 +31,13 @@ from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.priors.base import Prior
 from lp_framework.priors.zero123.networks import Networks
 from lp_framework.priors.zero123.prior import Zero123Prior
-from lp_framework.solvers.base import Solution
+from lp_framework.solvers.base import Solution, Solver
 from lp_framework.solvers.pair_energy import PairEnergy
 
 Plugins.instance()  # Hydra stores the configs of its own plugins once, as conftest.py has it
 ON_HOST = ("dust3r", "features", "vggt")  # matching and other people's packages compute in NumPy, or by themselves
 FORWARD_MODE = ("gauss_newton",)  # its derivatives do not pass through a device written in Python; see its own tests
+FEW_STEPS = {"steps": 6, "iterations": 6, "refinement_steps": 6, "exploration_steps": 3}  # a step costs much there
 PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1", "data.image_size=64")
 
 
@@ -45,6 +46,12 @@ def device(request: pytest.FixtureRequest) -> Iterator[None]:
     """Where commands run, it has no float64, as Apple's GPUs have none."""
     with pretended(double="chosen" not in request.fixturenames):
         yield
+
+
+def short(name: str) -> Solver:
+    """A solver of few steps, on the CPU."""
+    settings = inspect.signature(registry.get("solver", name)).parameters
+    return build(name, **{key: count for key, count in FEW_STEPS.items() if key in settings})
 
 
 def moved(batch: Any, device: torch.device = FAR) -> Any:
@@ -110,8 +117,8 @@ def test_a_priors_energy_is_the_same_there_and_its_gradient_waits_for_nothing(na
 def test_a_solver_finds_there_what_it_finds_here(name):
     pairs, true = exact_pairs(3)
     starts = around(true, 0.3, -0.4, 1.0)
-    here = build(name).solve(pairs, starts, seed=0)
-    solver = build(name)
+    here = short(name).solve(pairs, starts, seed=0)
+    solver = short(name)
     api.move(solver, FAR)
     there: Solution = solver.solve(moved(pairs), starts.to(FAR), seed=0)
     for quantity in ("poses", "energies", "valid", "chosen"):
@@ -124,8 +131,8 @@ def test_a_solver_finds_there_what_it_finds_here(name):
 def test_sets_of_images_too(name):
     sets, _ = exact_sets(2, 3)
     starts = torch.rand(2, 2, 3, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 6.0, 0.0])
-    here = build(name).solve_views(sets, starts, seed=0)
-    solver = build(name)
+    here = short(name).solve_views(sets, starts, seed=0)
+    solver = short(name)
     api.move(solver, FAR)
     there = solver.solve_views(moved(sets), starts.to(FAR), seed=0)
     torch.testing.assert_close(there.poses.cpu(), here.poses, rtol=0, atol=1e-3)
@@ -227,7 +234,7 @@ def test_training_learns_the_same_weights(commands, chosen, name, settings):
 
 
 def test_landscapes(commands, chosen):
-    grid = ("longitude_step_degrees=30", "latitude_step_degrees=20", "noises=1")
+    grid = ("longitude_step_degrees=60", "latitude_step_degrees=30", "noises=1")
     settings = (*grid, "checkpoint=./score", "prior.path=prior", "data.image_size=64")
     found = []
     for place in ("here", "there"):
@@ -255,26 +262,28 @@ def test_estimate_and_views(commands, chosen):
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1)
 
 
+AS_SMALL = {"cameras": ("figure.objects=[cup]", "figure.targets=1", "figure.starts=1")}
+
+
 @pytest.mark.parametrize("name", [name for name in SMALL if name != "recall"])  # which solves nothing
 def test_figures(commands, chosen, name):
     chosen()
     drawn = commands.here(
-        f"figure_{name}", "figure", f"experiment=figure_{name}", "prior.path=prior", "data.image_size=64", *SMALL[name]
+        f"figure_{name}",
+        "figure",
+        f"experiment=figure_{name}",
+        "prior.path=prior",
+        "data.image_size=64",
+        *SMALL[name],
+        *AS_SMALL.get(name, ()),
     )
     assert drawn.status == 0, drawn.err
 
 
-def test_bench(tmp_path, chosen):
+@pytest.mark.parametrize("measure", ["encoding", "first_stage", "second_stage", "pair", "precision", "checkpoint"])
+def test_bench(tmp_path, chosen, measure):  # others look at memory's addresses
     chosen()
-    names = [
-        "encoding",
-        "first_stage",
-        "second_stage",
-        "pair",
-        "precision",
-        "checkpoint",
-    ]  # others look at memory's addresses
     settings = {**FEW, "second_stage.architecture": "narrow", "second_stage.starts": "[1]", "second_stage.rounds": "1"}
     small = (f"{key}={value}" for key, value in settings.items())
-    ran = Commands(tmp_path, train_views=6).here("bench", "bench", f"measure=[{','.join(names)}]", *small)
+    ran = Commands(tmp_path, train_views=6).here("bench", "bench", f"measure=[{measure}]", *small)
     assert ran.status == 0, ran.err

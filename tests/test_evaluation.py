@@ -179,22 +179,6 @@ def test_a_sweep_has_a_folder_and_results_for_every_combination(commands):
     assert found[0, 1] != found[0.3, 1]
 
 
-@pytest.mark.heavy
-def test_two_processes_give_every_number_of_one(evaluated, commands):
-    spread = ("trainer.devices=2", "trainer.strategy=ddp", "trainer.accelerator=cpu")
-    two = commands.process("two", "eval", "checkpoint=./score", *spread)
-    assert (two.status, two.err) == (0, "")
-    assert "MEMBER: 1/2" in (two.folder / "eval.log").read_text()  # there were two
-    assert close(comparable(two), comparable(evaluated))
-    rows, expected = pair_rows(two), pair_rows(evaluated)
-    assert len(rows) == len(expected) == PAIRS
-    for row, wanted in zip(rows, expected, strict=True):
-        assert [row[key] for key in ("object", "reference", "query")] == [
-            wanted[key] for key in ("object", "reference", "query")
-        ]
-        assert float(row["rotation_error_degrees"]) == pytest.approx(float(wanted["rotation_error_degrees"]), abs=0.05)
-
-
 # ---------------------------------------------------------------- errors of a solution
 
 
