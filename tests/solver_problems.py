@@ -67,6 +67,9 @@ class ExactModel:
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue(condition - pose, None)
 
+    def probability(self, condition: Tensor, pose: Tensor) -> None:
+        return None
+
 
 class FailingPrior(ExactPrior):
     """Its energies, or only their gradients, are not numbers where a latitude is further than `limit` from 0."""

@@ -163,6 +163,9 @@ class Tells(torch.nn.Module):
         offset = condition - pose
         return FieldValue(torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1), None)
 
+    def probability(self, condition: torch.Tensor, pose: torch.Tensor) -> None:
+        return None
+
 
 class Told(PairBatch):
     """Images that say their poses; pixels would round them."""

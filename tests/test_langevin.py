@@ -35,6 +35,9 @@ class Exact:
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue((condition - pose) / self.sigma**2, None)
 
+    def probability(self, condition: Tensor, pose: Tensor) -> None:
+        return None
+
 
 class ExactEnergy(Exact):
     has_energy = True

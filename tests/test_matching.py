@@ -137,9 +137,22 @@ def test_each_mode_keeps_its_valley_at_little_smoothing_and_energy_chooses(told:
     assert solution.chosen.tolist() == [1]
 
 
+def test_ends_come_with_their_probability_more_even_than_the_density(told: TwoValleys):
+    starts = Modes(told, count=2).make(a_pair(), seed=0)
+    solution = Langevin(told, gamma=0.0, sigma=0.15).solve(a_pair(), starts, seed=0)
+    density = told.condition(torch.zeros(1, 1), torch.zeros(1, 1))
+    assert density[:, None].probability(solution.poses, 30.0)[0].tolist() == pytest.approx([0.6, 0.4], abs=0.02)
+    assert solution.probability is not None and solution.probability.shape == (1, 2)
+    first, second = solution.probability[0].tolist()
+    assert 0.35 < second < first < 0.58
+    wide = told.probability(density[:, None], solution.poses, degrees=120.0)
+    assert (wide > solution.probability).all() and (wide <= 1).all()
+
+
 def test_other_models_refuse_what_they_do_not_know():
     model = ScoreModel(EfficientNetLite0(hidden=8, features=4), hidden=8, layers=1)
     starts = torch.zeros(1, 1, 3)
+    assert Langevin(model).solve(a_pair(), starts, seed=0).probability is None
     with pytest.raises(UserError, match=r"solver\.sigma needs model=matching"):
         Langevin(model, sigma=0.2).solve(a_pair(), starts, seed=0)
     with pytest.raises(UserError, match="start=modes needs model=matching"):

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from lp_framework.geometry import camera_to_world, rotation_error
 from lp_framework.models.pose_density import GRID, PoseDensity, from_bins
 
 TURN = 2 * math.pi
@@ -85,3 +86,42 @@ def test_modes_of_a_mixture_are_its_components_in_order_of_weight():
 def test_probability_within_half_a_turn_is_one():
     density = some_density()
     assert torch.allclose(density.probability_near(torch.tensor([[3]] * 3), 180.0), torch.ones(3, 1).double())
+
+
+def drawn_poses(density: PoseDensity, count: int) -> torch.Tensor:
+    """Poses `[P, count, 3]` of the density, longitudes spread over the grid's steps, radius 1."""
+    random = torch.Generator().manual_seed(4)
+    places = density.probabilities.multinomial(count, replacement=True, generator=random)
+    between = torch.rand(places.shape, generator=random, dtype=torch.float64) - 0.5
+    longitude = (places + between) * TURN / GRID
+    normal = torch.randn(places.shape, generator=random, dtype=torch.float64)
+    latitude = density.mean[:, :1] + density.deviation[:, :1] * normal
+    return torch.stack([latitude, longitude, torch.ones_like(latitude)], dim=-1)
+
+
+@pytest.mark.parametrize("degrees", [10.0, 30.0, 90.0])
+def test_probability_is_the_share_of_draws_that_are_near(degrees: float):
+    density = some_density()
+    poses = some_poses(4) * torch.tensor([0.5, 1.0, 1.0])
+    told = density[:, None].probability(poses, degrees)
+    draws = drawn_poses(density, 40_000)
+    away = draws[:, None] - poses[:, :, None]
+    away = torch.stack([away[..., 0], torch.remainder(away[..., 1] + math.pi, TURN) - math.pi], dim=-1)
+    near = (away.norm(dim=-1) <= math.radians(degrees)).double().mean(dim=-1)
+    torch.testing.assert_close(told, near, rtol=0, atol=0.012)
+    assert told.shape == (3, 4) and (told.max() > 0.3 or degrees < 30)
+
+
+@pytest.mark.parametrize("latitude", [-0.5, 0.0, 0.7])
+def test_probability_errs_to_the_safe_side_whatever_the_latitude_of_the_reference(latitude: float):
+    """Against the rotation error itself, whose share within 30 degrees is never less."""
+    density = some_density()
+    poses = torch.stack([density.mean[:, 0], density.modes(1)[0][:, 0], torch.zeros(3).double()], dim=-1)[:, None]
+    reference = torch.tensor([latitude, 1.0, 0.0], dtype=torch.float64)
+    one = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    error = rotation_error(
+        camera_to_world(reference + drawn_poses(density, 40_000)), camera_to_world(reference + poses + one)
+    )
+    near = (error <= 30).double().mean(dim=1)
+    told = density[:, None].probability(poses, 30.0)[:, 0]
+    assert (told <= near + 0.01).all() and (told >= near - 0.1).all()

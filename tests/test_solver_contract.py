@@ -53,6 +53,7 @@ def test_a_solution_has_its_shapes_and_finite_numbers(name):
     assert ((solution.poses[..., 1] >= 0) & (solution.poses[..., 1] < 2 * torch.pi)).all()
     assert not solution.poses.requires_grad
     assert (solution.cost.network_passes > 0) == (name not in WITHOUT_NETWORK) and solution.cost.seconds > 0
+    assert solution.probability is None  # the model has no density
     assert torch.equal(solution.answer(), solution.poses[torch.arange(3), solution.chosen])
 
 

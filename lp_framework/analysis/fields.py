@@ -81,6 +81,9 @@ class ExactModel(nn.Module):
         energy = self.kernel.energy(pose, truth) if self.has_energy else None
         return FieldValue(self.kernel.score(pose, truth), energy)
 
+    def probability(self, condition: Tensor, pose: Tensor) -> None:
+        """See `PoseModel`: it has no density."""
+
 
 def grid_poses(radius: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
     """Relative poses `[B, A, O, 3]`, float32, at relative radii `[B]`, on their device."""

@@ -31,6 +31,9 @@ NEAR_AXIS = 0.35  # scene units: distance from the upright axis within which a p
 MEAN_RADIUS = 1.6
 SMALLEST_DEVIATION, LARGEST_DEVIATION = 0.05, 3.0  # of latitude and radius, in units of POSE_SCALE
 SAME_POINT = 0.05  # scene units: standard deviation of the distance between two matching cells' points
+# Densities are too sure of objects never met. Of procedural objects outside the training 1.5 would make them right, of
+# others, whose pictures differ more from those of the training, 2 to 3.
+TEMPERATURE = 2.0
 OVERLAPPING = 1.75  # radians: pairs farther apart in longitude see too few points together to learn matches from
 
 
@@ -110,6 +113,9 @@ class MatchingModel(PoseModel):
 
     def at_sigma(self, condition: PoseDensity, sigma: float) -> PoseDensity:
         return replace(condition, sigma=sigma)
+
+    def probability(self, condition: PoseDensity, pose: Tensor, degrees: float = 30.0) -> Tensor:
+        return replace(condition, logits=condition.logits / TEMPERATURE).probability(pose, degrees)
 
     def modes(self, condition: PoseDensity, count: int) -> Tensor:
         """The highest maxima of the longitude's density, at the latitude's and radius's means, `[P, count, 3]`."""

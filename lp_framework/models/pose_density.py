@@ -16,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lp_framework.geometry import wrap_angle
+
 GRID = 144  # longitudes at which densities are normalised, 2.5 degrees apart
 
 
@@ -82,6 +84,20 @@ class PoseDensity:
         shift = 0.5 * (left - right) / (left - 2 * middle + right).clamp(max=-1e-6)
         longitudes = torch.remainder((places + shift.clamp(-0.5, 0.5)) * (2 * math.pi / GRID), 2 * math.pi)
         return longitudes, self.probability_near(places)
+
+    def probability(self, pose: Tensor, degrees: float) -> Tensor:
+        """That the true rotation lies within so many degrees of those of relative poses `[..., 3]`, `[...]`.
+
+        It errs to the safe side. The angle between upright cameras, and that between viewing directions, depends on
+        the reference's latitude, which is not known; sqrt(dlatitude^2 + dlongitude^2) is never less than either.
+        """
+        reach = math.radians(degrees)
+        grid = torch.arange(GRID, device=pose.device) * (2 * math.pi / GRID)
+        away = wrap_angle(grid - pose[..., 1:2])
+        half = (reach**2 - away.square()).clamp(min=0).sqrt()  # of latitude, at each longitude of the grid
+        off, spread = pose[..., :1] - self.mean[..., :1], math.sqrt(2) * self.deviation[..., :1]
+        band = (((off + half) / spread).erf() - ((off - half) / spread).erf()) / 2
+        return (self.probabilities * band).sum(dim=-1)
 
     def probability_near(self, places: Tensor, degrees: float = 30.0) -> Tensor:
         """Of longitudes within so many degrees of places `[..., M]` of the grid."""

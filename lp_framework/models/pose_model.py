@@ -63,6 +63,11 @@ class PoseModel(TrainedModule):
         """The most likely poses `[P, count, 3]`, best first; `UserError` of a model that cannot tell them."""
         raise UserError("start=modes needs model=matching; score and energy networks cannot tell their modes")
 
+    def probability(self, condition: Any, pose: Tensor, degrees: float = 30.0) -> Tensor | None:
+        """That the true rotation lies within so many degrees of relative poses `[..., 3]`, `[...]`, which go with the
+        conditions as those of `field`; None of a model without a density."""
+        return None
+
     def at_sigma(self, condition: Any, sigma: float) -> Any:
         """The condition under which `field` is at another `sigma`; `UserError` of a model that knows only one."""
         raise UserError(

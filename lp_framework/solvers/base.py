@@ -90,7 +90,8 @@ class Solution:
     """`poses` `[B, N, 3]` final relative poses, `energies` `[B, N]` (lower is better, comparable along N), `valid`
     `[B, N]`, `chosen` `[B]` index of the start that is the answer; `cameras` `[B, N, 4, 4]` of solvers that predict
     full ones: the query's in the reference's frame, its translation up to a factor (see `geometry.two_view`);
-    `trajectory` `[B, N, steps + 1, 3]` on request, longitudes unreduced."""
+    `trajectory` `[B, N, steps + 1, 3]` on request, longitudes unreduced; `probability` `[B, N]` that the true rotation
+    is within 30 degrees of the pose's, of a model that has a density."""
 
     poses: Tensor
     energies: Tensor
@@ -99,6 +100,7 @@ class Solution:
     cost: Cost
     cameras: Tensor | None = None
     trajectory: Tensor | None = None
+    probability: Tensor | None = None
 
     def answer(self) -> Tensor:
         """The chosen poses `[B, 3]`."""
@@ -108,12 +110,14 @@ class Solution:
 @dataclass(frozen=True)
 class ViewSolution:
     """`poses` `[S, V - 1, 3]` of the other views relative to the first; `energies` `[S, V, V]` of the ordered pairs
-    (row: reference, column: query; NaN where a solver did not look); `valid` `[S]`: every pose is sound."""
+    (row: reference, column: query; NaN where a solver did not look); `valid` `[S]`: every pose is sound; `pairs`, where
+    each pair with the first view was solved for itself: the solution of those S x (V - 1) pairs."""
 
     poses: Tensor
     energies: Tensor
     valid: Tensor
     cost: Cost
+    pairs: Solution | None = None
 
 
 def choose(energies: Tensor) -> Tensor:
@@ -167,4 +171,5 @@ class Solver(ABC):
             energies=energies,
             valid=solution.valid.gather(1, chosen).view(sets, views - 1).all(dim=1),
             cost=solution.cost,
+            pairs=solution,
         )

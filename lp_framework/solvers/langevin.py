@@ -81,6 +81,7 @@ class Langevin(Solver):
             chosen=choose(energies),
             cost=Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks, now(starts.device) - began),
             trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
+            probability=self.model.probability(condition, pose),
         )
 
     def _noise(self, pairs: Pairs, starts: Tensor, seed: int) -> Tensor:
