@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from lp_framework.analysis.confidence import NEAR_DEGREES, Answer, answers
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
 from lp_framework.data.photographs import SIZE, photograph_files, prepared_photographs, save_png
@@ -33,8 +34,10 @@ log = logging.getLogger(__name__)
 
 COLUMNS = (
     "file", "image", "latitude_degrees", "longitude_degrees", "radius", "relative_latitude_degrees",
-    "relative_longitude_degrees", "relative_radius", "energy", "valid",
+    "relative_longitude_degrees", "relative_radius", "energy", "valid", "answer", "probability", "verdict",
+    "second_latitude_degrees", "second_longitude_degrees", "second_probability",
 )  # fmt: skip
+RADIUS_LOST = "the crop to the object loses the distance: radius is not estimated"
 
 
 def run(config: DictConfig) -> None:
@@ -46,10 +49,15 @@ def run(config: DictConfig) -> None:
     warn_of_unused(components)
     solver, starts = components["solver"], components["start"]
     move(solver, device)
+    move(starts, device)
     view_sets = view_set(prepared, device)
     with shown_progress():
         solution = solver.solve_views(view_sets, starts.make(view_sets.with_first(), config.seed)[None], config.seed)
     relative = torch.cat([torch.zeros(1, 3, dtype=torch.float64), solution.poses[0].detach().cpu().double()])
+    told = answers(solution.pairs)
+    radius_lost = config.crop and bool(told)
+    if radius_lost:
+        relative[:, 2] = 0.0
     absolute = apply_relative_pose(first, relative)
     energies = solution.energies[0].detach().cpu().double()
     if not solution.valid[0]:
@@ -59,12 +67,13 @@ def run(config: DictConfig) -> None:
         "network_passes": solution.cost.network_passes,
         "energies": energies.tolist(),
         "valid": bool(solution.valid[0]),
+        "answers": [_record(file, answer) for file, answer in zip(files[1:], told, strict=bool(told))],
         "checkpoint": str(components.checkpoint) if components.checkpoint else None,
         **components.record(),
     }
     write_json(folder / "results.json", result)
-    rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist())
-    _print(folder, rows)
+    rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist(), told)
+    _print(folder, rows, told, radius_lost)
     warn_of_prior(components)
 
 
@@ -72,6 +81,24 @@ def warn_of_prior(components: Components) -> None:
     """Warn of a prior that knows no photographs where the solver's answer rests on it."""
     if "prior" in components.needs("solver"):
         warn_of_photographs(components.settings["prior"])
+
+
+def _record(file: Path, answer: Answer) -> dict[str, Any]:
+    """An answer for `results.json`; angles in degrees."""
+    second = answer.second
+    return {
+        "file": str(file),
+        "answer": answer.words,
+        "probability": answer.probability,
+        "verdict": answer.verdict,
+        "second": None if second is None else dict(zip(COLUMNS[-3:], _second(second), strict=True)),
+    }
+
+
+def _second(second: Answer) -> list[float]:
+    """Latitude and longitude in degrees, and the probability."""
+    degrees = math.degrees(second.latitude), math.degrees(second.longitude) % 360
+    return [*(round(each, 4) for each in degrees), round(second.probability, 4)]
 
 
 def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
@@ -83,8 +110,9 @@ def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
 
 
 def _write(
-    folder: Path, files: Sequence[Path], prepared: Sequence[Image.Image], poses: Tensor, energies: Sequence[float]
-) -> list[list[Any]]:
+    folder: Path, files: Sequence[Path], prepared: Sequence[Image.Image], poses: Tensor, energies: Sequence[float],
+    told: Sequence[Answer],
+) -> list[list[Any]]:  # fmt: skip
     """The images and their cameras, of absolute and relative poses `[I, 6]`; returns the rows of `poses.csv`."""
     images = [f"images/{index:03d}.png" for index in range(len(files))]
     (folder / "images").mkdir(exist_ok=True)
@@ -100,7 +128,8 @@ def _write(
         [file, image, *(round(number, 4) for number in row), "" if math.isnan(energy) else f"{energy:.6g}", is_pose]
         for file, image, row, energy, is_pose in zip(files, images, numbers.tolist(), energies, valid, strict=True)
     ]
-    write_csv(folder / "poses.csv", COLUMNS, rows)
+    notes = [[""] * 6, *(_notes(answer) for answer in told)] if told else [[""] * 6] * len(rows)
+    write_csv(folder / "poses.csv", COLUMNS, [[*row, *note] for row, note in zip(rows, notes, strict=True)])
     found = [index for index, is_pose in enumerate(valid) if is_pose]
     cameras, names = poses[found, :3], [Path(images[index]).name for index in found]
     transforms = nerf_transforms([images[index] for index in found], cameras, FIELD_OF_VIEW_DEGREES)
@@ -109,11 +138,21 @@ def _write(
     for name, text in colmap_model(names, cameras, SIZE, FIELD_OF_VIEW_DEGREES).items():
         write_text(folder / "colmap" / name, text)
     pictures, titles = [prepared[index] for index in found], [files[index].name for index in found]
-    save_figure(cameras_figure(cameras.numpy(), pictures, found, titles, FIELD_OF_VIEW_DEGREES), folder / "cameras")
+    verdicts = [str(notes[index][2]) for index in found]
+    figure = cameras_figure(cameras.numpy(), pictures, found, titles, FIELD_OF_VIEW_DEGREES, verdicts)
+    save_figure(figure, folder / "cameras")
     return rows
 
 
-def _print(folder: Path, rows: Sequence[Sequence[Any]]) -> None:
+def _notes(answer: Answer) -> list[Any]:
+    """The last columns of `poses.csv`."""
+    if not answer.verdict:
+        return [""] * 6
+    second = ["", "", ""] if answer.second is None else _second(answer.second)
+    return [answer.words, round(answer.probability, 4), answer.verdict, *second]
+
+
+def _print(folder: Path, rows: Sequence[Sequence[Any]], told: Sequence[Answer], radius_lost: bool) -> None:
     """The rows of `poses.csv` for people, and where everything is."""
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -127,6 +166,14 @@ def _print(folder: Path, rows: Sequence[Sequence[Any]]) -> None:
             texts[3:] = ["reference"]
         table.add_row(file.name, *([*texts, energy] if is_pose else ["none"]))
     console.print(table)
+    for (file, *_), answer in zip(rows[1:], told, strict=bool(told)):
+        way = f"{rows[0][0].name} to {file.name}: {answer.words}"
+        chance = f"probability {answer.probability:.2f} to be within {NEAR_DEGREES:.0f}°"
+        console.print(f"{way}; {chance}: {answer.verdict}" if answer.verdict else way, soft_wrap=True)
+        if answer.second_words:
+            console.print(f"  second: {answer.second_words}", soft_wrap=True)
+    if radius_lost:
+        console.print(RADIUS_LOST)
     console.print(f"poses:   {folder}/transforms.json, poses.csv", soft_wrap=True)
     console.print(f"COLMAP:  {folder}/colmap", soft_wrap=True)
     console.print(f"images:  {folder}/images", soft_wrap=True)

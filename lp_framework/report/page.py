@@ -42,6 +42,7 @@ LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of 
 MOST_PLOTS = 4_000_000  # letters that the plots of one run's pairs may take; the last ones are left out beyond it
 MOST_CAMERAS = 40
 WORST = 20  # pairs in the table of the worst
+NOTES = ("answer", "probability", "verdict", "second_longitude_degrees", "second_probability")  # of a photograph
 POSE = ("latitude_degrees", "longitude_degrees", "radius")
 # What a damaged file leads to; `UserError` is a `ValueError`.
 BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, UndefinedError)
@@ -331,7 +332,9 @@ def _poses(folder: Path) -> dict[str, Any]:
     poses = [[float(row[key]) for key in keys] if row["valid"] == "True" else None for row in rows]
     images = [tried(partial(_image, folder, row), None) for row in rows]
     names = [Path(row["file"]).name for row in rows]
-    return {"rows": list(zip(names, images, poses, [row["energy"] for row in rows], strict=True))}
+    energies = [row["energy"] for row in rows]
+    notes = [[row.get(key, "") for key in NOTES] for row in rows] if any(row.get("verdict") for row in rows) else None
+    return {"rows": list(zip(names, images, poses, energies, strict=True)), "notes": notes}
 
 
 def _image(folder: Path, row: Mapping[str, str]) -> NDArray:

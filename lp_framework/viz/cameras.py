@@ -31,6 +31,8 @@ MOST_CARDS, CARD_COLUMNS = 12, 6
 # Inches: the figure's width, the title, the tallest scene, the text below an image, gaps between images.
 WIDTH, TOP, TALLEST, TEXT, GAP = 8.0, 0.3, 4.6, 0.66, 0.12
 
+TRUSTED = {"trust": style.GREEN, "doubtful": style.ORANGE, "do not trust": VERMILION}  # a colour a verdict
+
 # Of the figure of methods.
 RED, SKY = "#D7191C", "#56B4E9"
 TARGETS = (BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, MUTED)  # a colour a target view
@@ -137,18 +139,20 @@ def shrunk(image: Image.Image) -> Image.Image:
 @styled
 def cameras_figure(
     poses: NDArray, images: Sequence[Image.Image], numbers: Sequence[int], titles: Sequence[str],
-    field_of_view_degrees: float,
+    field_of_view_degrees: float, verdicts: Sequence[str] = (),
 ) -> Figure:  # fmt: skip
     """Cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title, and below them the
-    images (the first `MOST_CARDS`) with their poses. The first is the reference; its image also stands for the object.
+    images (the first `MOST_CARDS`) with their poses, and with `verdicts` on them (a key of `TRUSTED`, or nothing). The
+    first is the reference; its image also stands for the object.
     """
+    verdicts = verdicts or [""] * len(images)
     cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())
     middle = image_plane(cameras[0], float(poses[0, 2]), half_angle)  # through the object's centre
     distance = furthest * (NEAR_BY if len(poses) <= 5 else 0.8 * NEAR_BY)
     planes = [image_plane(camera, distance, half_angle) for camera in cameras]
     points = np.concatenate([middle, *planes, cameras[:, :3, 3]])
     scene = Scene(best_viewpoint(poses), points, furthest)
-    colours = [BLUE, *[VERMILION] * (len(poses) - 1)]
+    colours = [BLUE, *(TRUSTED.get(verdict, VERMILION) for verdict in verdicts[1:])]
     tall, cards = min(TALLEST, scene.height(WIDTH)), min(len(images), MOST_CARDS)
     side = (WIDTH - 2 * SIDE - GAP * (CARD_COLUMNS - 1)) / CARD_COLUMNS
     rows = math.ceil(cards / CARD_COLUMNS)
@@ -173,8 +177,10 @@ def cameras_figure(
         y = TOP + tall + row * (side + TEXT)
         sheet.image(x, y, side, on_white(images[index]), color=colours[index], linewidth=1.0)
         sheet.text(x + 0.08, y + side + 0.1, str(numbers[index]), **_badge(colours[index]))
-        name = shortened(titles[index], 14 * side - 3)
-        sheet.text(x + 0.2, y + side + 0.1, name, fontsize=7.5, fontweight="bold", va="center_baseline")
+        verdict = f": {verdicts[index]}" if verdicts[index] else ""
+        name = shortened(titles[index], 14 * side - 3 - len(verdict)) + verdict
+        look = {"color": colours[index]} if verdict else {}
+        sheet.text(x + 0.2, y + side + 0.1, name, fontsize=7.5, fontweight="bold", va="center_baseline", **look)
         latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
         pose = f"latitude {latitude:.1f}°\nlongitude {longitude:.1f}°\nradius {poses[index, 2]:.2f}"
         sheet.text(x, y + side + 0.2, pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, va="top")

@@ -1,0 +1,94 @@
+"""What an answer is worth, for people: how probable it is, what else the pair may mean, and whether to trust it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from torch import Tensor
+
+from lp_framework.geometry import wrap_angle
+from lp_framework.solvers.base import Solution
+
+NEAR_DEGREES = 30.0  # of `Solution.probability`
+TRUST, DOUBT = 0.8, 0.5  # probabilities from which an answer is to be trusted, and from which it is only doubtful
+WORTH_TELLING = 0.05  # probability of a second answer
+
+
+class Answer(NamedTuple):
+    """The answer to a pair and, if any, a second one: latitude and longitude (radians), relative to the reference, and
+    the probability that the true rotation is within 30 degrees of it."""
+
+    latitude: float
+    longitude: float
+    probability: float
+    second: Answer | None = None
+
+    @property
+    def words(self) -> str:
+        """Where the camera goes from the reference's place; see `in_words`."""
+        return in_words(self.latitude, self.longitude)
+
+    @property
+    def verdict(self) -> str:
+        """`trust`, `doubtful` or `do not trust`; nothing where no pose was found."""
+        if not math.isfinite(self.probability):
+            return ""
+        return "trust" if self.probability >= TRUST else "doubtful" if self.probability >= DOUBT else "do not trust"
+
+    @property
+    def second_words(self) -> str:
+        """The second answer, and how it may come about; nothing where there is none."""
+        if self.second is None:
+            return ""
+        turn = abs(math.degrees(_turn(self.second.longitude - self.longitude)))
+        why = " (about half a turn away: the back looks alike)" if turn > 180 - NEAR_DEGREES else ""
+        return f"{self.second.words}, probability {self.second.probability:.2f}{why}"
+
+
+def answers(solution: Solution | None) -> list[Answer]:
+    """The answer to every pair, with the most probable end that shares no rotation within 30 degrees with it as the
+    second one; an empty list where no model told a probability."""
+    if solution is None or solution.probability is None:
+        return []
+    found = []
+    for poses, shares, first in zip(
+        solution.poses.detach().cpu(), solution.probability.detach().cpu(), solution.chosen.tolist(), strict=True
+    ):
+        apart = _away(poses, poses[first]) > math.radians(2 * NEAR_DEGREES)
+        other = int(shares.masked_fill(~apart, -1.0).nan_to_num(nan=-1.0).argmax())
+        second = _answer(poses[other], shares[other]) if apart[other] and shares[other] >= WORTH_TELLING else None
+        found.append(_answer(poses[first], shares[first])._replace(second=second))
+    return found
+
+
+def in_words(latitude: float, longitude: float) -> str:
+    """A relative pose (radians), as a camera moves that looks at the object: its longitude grows to the right.
+
+    >>> in_words(math.radians(10), math.radians(330)), in_words(0.0, math.pi), in_words(0.0, 0.001)
+    ('30° to the left, 10° up', '180° round', 'the same viewpoint')
+    """
+    if not math.isfinite(latitude + longitude):
+        return "no pose"
+    up, right = round(math.degrees(latitude)), round(math.degrees(_turn(longitude)))
+    parts = (
+        [f"{abs(right)}° {'round' if abs(right) == 180 else 'to the right' if right > 0 else 'to the left'}"]
+        if right
+        else []
+    )
+    parts += [f"{abs(up)}° {'up' if up > 0 else 'down'}"] if up else []
+    return ", ".join(parts) or "the same viewpoint"
+
+
+def _answer(pose: Tensor, probability: Tensor) -> Answer:
+    return Answer(pose[0].item(), pose[1].item(), probability.item())
+
+
+def _away(poses: Tensor, pose: Tensor) -> Tensor:
+    """Angles `[N]`, which those of the rotations do not exceed, between poses `[N, 3]` and one."""
+    return ((poses[:, 0] - pose[0]).square() + wrap_angle(poses[:, 1] - pose[1]).square()).sqrt()
+
+
+def _turn(longitude: float) -> float:
+    """The same angle in [-pi, pi]."""
+    return math.remainder(longitude, 2 * math.pi)
