@@ -253,7 +253,8 @@ def test_estimate_and_views(commands, chosen):
     for place in ("here", "there"):
         settings = ("prior.path=prior", "crop=false")
         images = (f"images=[{files[0]},{files[1]}]", "checkpoint=./score", "solver.refinement_steps=3")
-        estimated = commands.here(f"estimate_{place}", "estimate", *images, *settings)
+        chosen_solver = ("solver=two_stage", "start=grid")
+        estimated = commands.here(f"estimate_{place}", "estimate", *images, *settings, *chosen_solver)
         views = commands.here(f"views_{place}", "views", f"image={files[0]}", "longitudes=2", "steps=3", *settings)
         assert (estimated.status, views.status) == (0, 0), (estimated.err, views.err)
         drawn = sorted((views.folder / "views").glob("*.png"))

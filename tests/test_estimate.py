@@ -19,6 +19,7 @@ from matplotlib.image import imread
 from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
+from toy_views import toy_view
 
 import lp_framework
 from lp_framework import registry
@@ -61,6 +62,11 @@ SOLVER = '''
 '''
 
 
+CONFIDENCE = (
+    "answer", "probability", "verdict", "second_latitude_degrees", "second_longitude_degrees", "second_probability",
+)  # fmt: skip
+
+
 @pytest.fixture
 def photos(tmp_path: Path, write: Callable[[str, str], Path]) -> Path:
     """A folder with three photographs, darker from one to the next, where the solver above is a plugin."""
@@ -86,7 +92,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def estimate(lp: Callable[..., Finished], *overrides: str) -> Finished:
-    return lp("estimate", "solver=tmp_brightness", "hydra.run.dir=run", *overrides)
+    return lp("estimate", "solver=tmp_brightness", "start=grid", "hydra.run.dir=run", *overrides)
 
 
 # ---------------------------------------------------------------- the command
@@ -110,6 +116,7 @@ def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
         assert absolute == pytest.approx([math.degrees(pose[0]), math.degrees(pose[1]), pose[2]], abs=1e-3)
         assert float(row["relative_longitude_degrees"]) == pytest.approx(math.degrees(longitude), abs=1e-3)
         assert row["valid"] == "True"
+        assert all(row[key] == "" for key in CONFIDENCE)  # this solver tells no probability
     assert [float(table[1][f"relative_{key}"]) for key in ("latitude_degrees", "radius")] == pytest.approx(
         [math.degrees(0.1), 0.2], abs=1e-3
     )
@@ -248,7 +255,7 @@ def test_files_arrays_and_images_are_the_same_pictures(tmp_path: Path):
     recorder = Recorder()
     arrays = [np.asarray(image) for image in images]
     for reference, query in (files, map(str, files), images, arrays, [array / 255 for array in arrays]):
-        lp_framework.estimate_pose(reference, query, solver=recorder, seed=5)
+        lp_framework.estimate_pose(reference, query, solver=recorder, starts="grid", seed=5)
     expected = np.stack([on_white(prepare(image, "a")) for image in images])
     for pairs, starts, seed in recorder.seen:
         pixels = ((pairs.images + 1) * 127.5).round().permute(0, 2, 3, 1)
@@ -270,7 +277,7 @@ def test_starts_by_name_or_built():
 def test_the_views_of_a_rendering_are_taken_whole():
     recorder = Recorder()
     view = placed(drawn(80, 60), 30, 20, 256, 256)
-    lp_framework.estimate_pose(view, view, solver=recorder, crop=False)
+    lp_framework.estimate_pose(view, view, solver=recorder, starts="grid", crop=False)
     np.testing.assert_array_equal(
         ((recorder.seen[0][0].images[0] + 1) * 127.5).round().permute(1, 2, 0), on_white(view)
     )
@@ -292,11 +299,25 @@ def test_mistakes_name_the_picture():
         lp_framework.estimate_pose(image, image, solver=recorder, starts="grit")
 
 
-def test_it_works_out_of_the_box_and_names_mean_what_they_do_elsewhere():
+def test_it_works_out_of_the_box_on_objects_never_met(recwarn):
+    views = [toy_view("soup_can", *place) for place in ((10, 20), (20, 80))]
+    solution = lp_framework.estimate_pose(*views)
+    latitude, longitude, radius = solution.answer()[0].tolist()
+    assert math.degrees(longitude) == pytest.approx(60, abs=15) and math.degrees(latitude) == pytest.approx(10, abs=10)
+    assert solution.poses.shape == (1, 4, 3) and solution.probability.shape == (1, 4)
+    assert solution.probability[0, solution.chosen[0]] > 0.8
+    assert radius == 0  # the crop loses it
+    assert not [each for each in recwarn if "prior" in str(each.message)]
+    whole = lp_framework.estimate_pose(*views, crop=False)
+    assert whole.answer()[0, 2] != 0
+
+
+def test_names_mean_what_they_do_elsewhere_and_other_models_have_no_probability():
     reference, query = placed(drawn(80, 60), 30, 20), placed(drawn(60, 80), 30, 20)
     with pytest.warns(UserWarning, match="knows the twelve embedded objects"):
-        solution = lp_framework.estimate_pose(reference, query)
+        solution = lp_framework.estimate_pose(reference, query, solver="two_stage", starts="grid", model="score")
     assert solution.poses.shape == (1, 9, 3) and solution.valid.all() and solution.answer().isfinite().all()
+    assert solution.probability is None
     model = lp_framework.load_model(Path(lp_framework.__file__).parent / "weights" / "score")
     solver = lp_framework.load_solver("two_stage", model=model, prior=lp_framework.load_prior("tiny"))
     built = lp_framework.estimate_pose(
@@ -312,5 +333,62 @@ def test_who_rests_on_the_prior_that_ships_is_told(lp, clean_registry, caplog):
         warn_of_prior(Components(plain(OmegaConf.create(printed))))
         return "prior=tiny as it ships knows the twelve embedded objects" in caplog.text
 
-    assert told() and told("solver=ifusion")
-    assert not told("prior.path=mine") and not told("prior=zero123xl") and not told("solver=langevin")
+    assert told("solver=two_stage") and told("solver=ifusion")
+    assert not told() and not told("solver=two_stage", "prior=zero123xl") and not told("solver=langevin")
+    assert not told("solver=ifusion", "prior.path=mine")
+
+
+# ---------------------------------------------------------------- what people get
+
+
+def saved_views(folder: Path, **places: tuple[str, float, float]) -> list[str]:
+    """Views of embedded objects as files `NAME.png`."""
+    for name, place in places.items():
+        toy_view(*place).save(folder / f"{name}.png")
+    return [f"{name}.png" for name in places]
+
+
+def test_by_default_each_image_gets_an_answer_in_words_and_its_confidence(lp, tmp_path: Path):
+    files = saved_views(tmp_path, a=("soup_can", 10, 20), b=("soup_can", 20, 80), c=("soup_can", 10, 350))
+    finished = lp("estimate", f"images=[{','.join(files)}]", "hydra.run.dir=run")
+    assert finished.status == 0, finished.err
+    assert finished.out.startswith("model: general, which ships with lp_framework")
+    assert "prior" not in finished.out + finished.err
+    table = rows(tmp_path / "run")
+    assert all(table[0][key] == "" for key in CONFIDENCE)
+    answers = json.loads((tmp_path / "run/results.json").read_text())["answers"]
+    for row, answer, truth in zip(table[1:], answers, (60, 330), strict=True):
+        assert float(row["relative_longitude_degrees"]) == pytest.approx(truth, abs=15)
+        assert float(row["relative_radius"]) == 0 and float(row["radius"]) == 1.4
+        side = "right" if truth < 180 else "left"
+        assert f"° to the {side}" in row["answer"] and float(row["probability"]) > 0.8 and row["verdict"] == "trust"
+        assert (answer["file"], answer["answer"], answer["verdict"]) == (row["file"], row["answer"], row["verdict"])
+        line = (
+            f"a.png to {row['file']}: {row['answer']}; probability {answer['probability']:.2f} to be within 30°: trust"
+        )
+        assert line in finished.out
+    lost = "the crop to the object loses the distance: radius is not estimated"
+    assert finished.out.count(lost) == 1
+    page = (tmp_path / "run/report.html").read_text()
+    assert table[1]["answer"] in page and ">trust<" in page
+    whole = lp("estimate", f"images=[{','.join(files)}]", "hydra.run.dir=whole", "crop=false")
+    assert lost not in whole.out and float(rows(tmp_path / "whole")[1]["relative_radius"]) != 0
+
+
+def test_what_looks_alike_from_behind_has_a_second_answer(lp, tmp_path: Path):
+    """The tram's front and back differ in colour alone."""
+    files = saved_views(tmp_path, a=("tram", 5, 30), b=("tram", 10, 50))
+    finished = lp("estimate", f"images=[{','.join(files)}]", "hydra.run.dir=run")
+    row = rows(tmp_path / "run")[1]
+    first, second = float(row["relative_longitude_degrees"]), float(row["second_longitude_degrees"])
+    assert abs((second - first) % 360 - 180) < 30 and float(row["second_probability"]) >= 0.05
+    assert "second: " in finished.out and "about half a turn away: the back looks alike" in finished.out
+
+
+def test_a_prior_may_still_choose_among_the_modes(lp, tmp_path: Path):
+    files = saved_views(tmp_path, a=("soup_can", 10, 20), b=("soup_can", 20, 80))
+    settings = ("solver=two_stage", "solver.iterations=0", "solver.refinement_steps=2", "hydra.run.dir=run")
+    finished = lp("estimate", f"images=[{','.join(files)}]", *settings)
+    assert finished.status == 0, finished.err
+    assert "prior=tiny as it ships knows the twelve embedded objects" in finished.err
+    assert all(row[key] == "" for row in rows(tmp_path / "run") for key in CONFIDENCE)

@@ -91,8 +91,9 @@ def warn_of_unused(components: Components) -> None:
     """Say that a prior or a checkpoint named on the command line has no effect on this solver; not in a sweep."""
     job, name = HydraConfig.get(), components.settings["solver"]["name"]
     named = {override.partition("=")[0].strip("+~").partition(".")[0] for override in job.overrides.task}
+    needed = {*components.needs("solver"), *(components.needs("start") if "start" in components.settings else ())}
     for key, component in (("prior", "prior"), ("checkpoint", "model")):
-        if key in named and component not in components.needs("solver") and job.mode != RunMode.MULTIRUN:
+        if key in named and component not in needed and job.mode != RunMode.MULTIRUN:
             log.warning("%s=... has no effect: solver=%s takes no %s", key, name, component)
 
 

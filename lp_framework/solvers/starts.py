@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import keyed_uniform
@@ -22,6 +22,10 @@ class Starts(ABC):
     """Makes `count` starts a pair. A constructor may declare a `model` or a `prior`, as a solver's may."""
 
     count: int
+
+    def networks(self) -> list[nn.Module]:
+        """The networks that they were given, to be moved to a device."""
+        return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     @abstractmethod
     def make(self, pairs: Pairs, seed: int) -> Tensor:
