@@ -106,6 +106,14 @@ def test_nearer_cameras_hide_farther_ones():
     assert far < middle < near
 
 
+def test_verdicts_are_written_and_colour_their_cameras():
+    poses = np.array([[0.0, 0.0, 1.4], [0.0, 1.0, 1.4], [0.0, 2.0, 1.4]])
+    images = [Image.fromarray(draw_view(pose, 32)) for pose in poses]
+    figure = cameras_figure(poses, images, range(3), ["a", "b", "c"], 49.1, ["", "trust", "do not trust"])
+    colours = {text.get_text(): text.get_color() for text in figure.texts}
+    assert colours["trust"] == cameras.TRUSTED["trust"] != colours["do not trust"] == cameras.TRUSTED["do not trust"]
+
+
 def test_an_image_seen_edge_on_is_left_out(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cameras, "best_viewpoint", lambda poses: viewpoint(0.0, math.pi / 2))
     poses = np.array([[0.0, 0.0, 1.4], [0.0, 1.0, 1.4]])

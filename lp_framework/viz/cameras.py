@@ -177,13 +177,14 @@ def cameras_figure(
         y = TOP + tall + row * (side + TEXT)
         sheet.image(x, y, side, on_white(images[index]), color=colours[index], linewidth=1.0)
         sheet.text(x + 0.08, y + side + 0.1, str(numbers[index]), **_badge(colours[index]))
-        verdict = f": {verdicts[index]}" if verdicts[index] else ""
-        name = shortened(titles[index], 14 * side - 3 - len(verdict)) + verdict
-        look = {"color": colours[index]} if verdict else {}
-        sheet.text(x + 0.2, y + side + 0.1, name, fontsize=7.5, fontweight="bold", va="center_baseline", **look)
+        name = shortened(titles[index], 14 * side - 3)
+        sheet.text(x + 0.2, y + side + 0.1, name, fontsize=7.5, fontweight="bold", va="center_baseline")
         latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
         pose = f"latitude {latitude:.1f}°\nlongitude {longitude:.1f}°\nradius {poses[index, 2]:.2f}"
         sheet.text(x, y + side + 0.2, pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, va="top")
+        if verdicts[index]:
+            look = {"fontsize": 6, "fontweight": "bold", "color": colours[index], "ha": "right", "va": "top"}
+            sheet.text(x + side, y + side + 0.455, verdicts[index], **look)  # beside the radius
     return sheet.figure
 
 
