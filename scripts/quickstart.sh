@@ -1,11 +1,15 @@
 #!/usr/bin/env bash
-# The main job from nothing: install, render the embedded objects, train a score model, evaluate it with and without
-# the second stage.
+# The main job from nothing: install, estimate the pose between two pictures, then render the embedded objects, train a
+# score model, evaluate it with and without the second stage.
 # Existing outputs are reused; arguments go to the training, e.g. `model=energy`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh ""  # without what only the tests need
 python=.venv/bin/python
+echo "quickstart: estimating where the camera went between two pictures of a can that the model has never met"
+$python -m lp_framework estimate "images=[docs/pictures/example_0.png,docs/pictures/example_1.png]" \
+    hydra.run.dir=runs/quickstart_estimate
+echo
 run="runs/quickstart"
 if [ -f "$run/training.json" ] && [ $# -eq 0 ]; then
     echo "quickstart: $run holds a trained model; delete the folder to train anew"
