@@ -102,7 +102,7 @@ def _warped(points: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray
 def decoded_renderings(
     views: Sequence[ObjectViews], share: float, size: int, folder: str | Path
 ) -> tuple[str, NDArray]:
-    """Key and array `[N]` of renderings with depth, of which `share` are made to look like photographs.
+    """Key and array `[N]` of renderings with depth; those of `share` of the objects are made to look like photographs.
 
     A row has `pixels` (size, size, 3), uint8 on white; `points` (CELLS^2, 3), float16, that its cells show, in the
     object's frame, NaN where there is nothing; and `cropped`, whether it was made to look like a photograph.
@@ -113,13 +113,13 @@ def decoded_renderings(
     def blocks() -> Iterator[NDArray]:
         for each in tracked(views, "decoding renderings"):
             block = np.zeros(len(each), record)
+            cropped = np.random.default_rng(stable_id(each.name)).random() < share
             rows = zip(each.files, depth_files(each.files), each.cameras.numpy(), strict=True)
             for row, (file, depth, camera) in enumerate(rows):
                 with opened(file) as image, opened(depth) as levels:
                     pixels = np.asarray(image.convert("RGBA"))
                     points = _points(scene_depth(levels), camera, each.field_of_view)
                 random = np.random.default_rng(stable_id(f"{each.name}/{file.name}"))
-                cropped = random.random() < share
                 if cropped:
                     pixels, points = like_photograph(pixels, points, random)
                 block[row]["pixels"] = pixels_on_white(Image.fromarray(pixels), size)
@@ -128,7 +128,7 @@ def decoded_renderings(
             yield block
 
     seen_from = [(each.name, each.cameras.tolist(), each.field_of_view) for each in views]
-    key = content_key([*files, *depth_files(files)], "renderings", share, size, CELLS, seen_from)
+    key = content_key([*files, *depth_files(files)], "renderings by object", share, size, CELLS, seen_from)
     return key, cached_array(folder, key, len(files), blocks)
 
 

@@ -45,7 +45,8 @@ class MatchingModel(PoseModel):
     random choice of those that show it. `flips` mirrors so large a share of the training objects, `feature_noise` is in
     units of the features' spread. The losses: the longitude's and the Gaussians' negative log-likelihood, and with the
     weights `point_loss`, `azimuth_loss`, `match_loss` of what rendered depth tells: a cell's point in space, its
-    azimuth, its true matches.
+    azimuth, its true matches. In use, views and their mirror images are averaged, and the log-density of the longitude
+    is divided by `temperature` (Guo et al. 2017), above 1 where a trained model is too sure of itself.
     """
 
     backbone: EfficientNetLite0Maps
@@ -67,6 +68,7 @@ class MatchingModel(PoseModel):
         dropout: float = 0.05,
         feature_noise: float = 0.15,
         flips: float = 0.5,
+        temperature: float = 1.0,
         point_loss: float = 1.0,
         azimuth_loss: float = 2.0,
         match_loss: float = 0.5,
@@ -81,10 +83,12 @@ class MatchingModel(PoseModel):
             "model",
             ("sigma", sigma, sigma > 0, "above 0"),
             ("flips", flips, 0 <= flips <= 1, "in [0, 1]"),
+            ("temperature", temperature, temperature > 0, "above 0"),
         )
         if not isinstance(backbone, EfficientNetLite0Maps):
             raise UserError("model=matching needs maps of local features: backbone=efficientnet_lite0_maps")
         self.sigma, self.kernel = sigma, PoseKernel("periodic", sigma)
+        self.temperature = temperature
         self.cells, self.training_cells = cells, training_cells
         self.pairs_per_object, self.feature_noise, self.flips = pairs_per_object, feature_noise, flips
         self.point_loss, self.azimuth_loss, self.match_loss = point_loss, azimuth_loss, match_loss
@@ -97,15 +101,17 @@ class MatchingModel(PoseModel):
     # ------------------------------------------------------------ use
 
     def encode(self, images: Tensor) -> ViewCells:
-        """The cells of images `[I, 3, H, W]` in [-1, 1]."""
+        """The cells of images `[I, 3, H, W]` in [-1, 1] and of their mirror images: each field `[I, 2, ...]`."""
         return self._encode(self.backbone.trunk(images))
 
     def condition(self, reference: ViewCells, query: ViewCells) -> PoseDensity:
-        """The densities of P pairs, from the cells of either side."""
-        with torch.autocast(reference.descriptor.device.type, enabled=False):
-            logits, mean, deviation = self.voting(reference, query)
-        deviation = deviation.exp().clamp(SMALLEST_DEVIATION, LARGEST_DEVIATION)
-        return PoseDensity(from_bins(logits), mean * self.pose_scale, deviation * self.pose_scale, self.sigma)
+        """The densities of P pairs, from the cells of either side: the mean of what views and mirrored views tell."""
+        told = self._density(reference.flattened(), query.flattened())
+        straight, mirrored = told.logits.log_softmax(dim=-1).unflatten(0, (-1, 2)).unbind(dim=1)
+        logits = torch.logaddexp(straight, mirrored.flip(-1).roll(1, -1)) / self.temperature
+        mean = told.mean.unflatten(0, (-1, 2))
+        variance = told.deviation.square().unflatten(0, (-1, 2)).mean(dim=1) + mean.var(dim=1, correction=0)
+        return PoseDensity(logits, mean.mean(dim=1), variance.sqrt(), self.sigma)
 
     def field(self, condition: PoseDensity, pose: Tensor) -> FieldValue:
         """Score and energy at relative poses `[..., 3]`, of the density smoothed by the condition's `sigma`."""
@@ -124,8 +130,16 @@ class MatchingModel(PoseModel):
         return torch.stack([latitude, longitude, radius], dim=-1)
 
     def _encode(self, maps: Tensor) -> ViewCells:
-        features, coverage, cells = self._foremost(maps, self.cells)
-        return self.encoder(self._standardised(features, coverage), coverage, cells)[0]
+        both = torch.stack([maps, self.backbone.mirrored(maps)], dim=1).flatten(0, 1)
+        features, coverage, cells = self._foremost(both, self.cells)
+        return self.encoder(self._standardised(features, coverage), coverage, cells)[0].unflattened(2)
+
+    def _density(self, reference: ViewCells, query: ViewCells) -> PoseDensity:
+        """As the networks tell it, of P pairs of views."""
+        with torch.autocast(reference.descriptor.device.type, enabled=False):
+            logits, mean, deviation = self.voting(reference, query)
+        deviation = deviation.exp().clamp(SMALLEST_DEVIATION, LARGEST_DEVIATION)
+        return PoseDensity(from_bins(logits), mean * self.pose_scale, deviation * self.pose_scale, self.sigma)
 
     def _foremost(self, maps: Tensor, count: int, shuffle: torch.Generator | None = None) -> tuple[Tensor, ...]:
         """Features `[I, K, F]`, coverage `[I, K, 4]` and numbers `[I, K]` of the cells that show most of the object."""
@@ -158,7 +172,7 @@ class MatchingModel(PoseModel):
         views, told_points = self.encoder(features, coverage, cells)
         pairs = self._some_pairs(batch, random)
         reference, query = batch.reference[pairs], batch.query[pairs]
-        density = self.condition(views[reference], views[query])
+        density = self._density(views[reference], views[query])
         true = relative_pose(poses[reference], poses[query])
         cropped = batch.cropped.to(reference.device)
         losses = {

@@ -9,6 +9,7 @@ no match), votes are harmonics of the azimuths, summed over all pairs of cells.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import torch
@@ -45,7 +46,18 @@ class ViewCells:
         return len(self.pose)
 
     def __getitem__(self, index: Tensor) -> ViewCells:
-        return ViewCells(**{each.name: getattr(self, each.name)[index] for each in fields(self)})
+        return self._each(lambda value: value[index])
+
+    def flattened(self) -> ViewCells:
+        """Views `[I, N]` as `[I x N]`."""
+        return self._each(lambda value: value.flatten(0, 1))
+
+    def unflattened(self, count: int) -> ViewCells:
+        """Views `[I x count]` as `[I, count]`."""
+        return self._each(lambda value: value.unflatten(0, (-1, count)))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> ViewCells:
+        return ViewCells(**{each.name: change(getattr(self, each.name)) for each in fields(self)})
 
 
 class Layer(nn.Module):
