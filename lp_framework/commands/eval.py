@@ -20,6 +20,7 @@ from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError
 from lp_framework.evaluation import journal
+from lp_framework.evaluation.breakdown import breakdown, lines
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import RESULT, summary_rows, terminal_table, write_result
 from lp_framework.models.checkpoints import find_checkpoint
@@ -86,6 +87,7 @@ def run(config: DictConfig) -> None:
     if before is not None and before["versions"] != result["versions"]:
         result["versions_before"] = before["versions"]  # of what was solved before it was stopped
     if trainer.is_global_zero:
+        result["breakdown"] = breakdown(evaluation.metrics.rows(), evaluation.table)
         write_result(folder, result, evaluation.metrics, evaluation.table)
         kept.finish()
         pictures = []
@@ -155,6 +157,10 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
     counted = f"pairs ({config['protocol']})" if views is None else f"poses in sets of {views} images"
     console.print(terminal_table(f"{choices}, {result['pairs']} {counted}", summary_rows(result)))
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
+    told = result["breakdown"]
+    if told and told["calibration"]:  # of a model that tells how sure it is
+        for line in lines(told):
+            console.print(line, soft_wrap=True)
     if result["unanswered"]:
         console.print(f"no answer for {result['unanswered']:.1%} of the pairs")
     console.print(f"results:  {folder / 'results.json'}", soft_wrap=True)

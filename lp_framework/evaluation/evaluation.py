@@ -101,12 +101,20 @@ class Evaluation(LightningModule):
             translation=translation.double(),
             chosen=solution.chosen.cpu(),
             answer=solution.answer().cpu().double(),
+            probability=_of_chosen(solution),
             seconds=solution.cost.seconds,
             passes=solution.cost.network_passes,
         )
         self.metrics.update(solved)
         if self.journal is not None:
             self.journal.append(solved, self.global_rank)
+
+
+def _of_chosen(solution: Solution) -> Tensor:
+    """The probability of each answer `[P]`, float64 on the CPU; NaN where the model tells none."""
+    if solution.probability is None:
+        return torch.full((len(solution.chosen),), torch.nan, dtype=torch.float64)
+    return solution.probability.gather(1, solution.chosen[:, None])[:, 0].cpu().double()
 
 
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:

@@ -79,10 +79,9 @@ class Journal:
                         name: torch.from_numpy(np.array(value)) if isinstance(value, list) else value
                         for name, value in json.loads(text).items()
                     }
-                    solved = SolvedBatch(**values)
-                    if solved.pair.ndim != 2:
+                    if {*values} != {*SolvedBatch._fields}:
                         raise UserError(f"{file}: is of an earlier version of lp_framework; remove {self.folder}")
-                    yield solved
+                    yield SolvedBatch(**values)
                 elif line:
                     log.info("%s: line %d is cut short or damaged, its pairs are solved again", file, number + 1)
 

@@ -14,7 +14,7 @@ from lp_framework.models.pair_mean import HostMetric, first_of_each
 
 ROTATION_THRESHOLDS = (5, 15, 30)  # degrees
 TRANSLATION_THRESHOLD = 0.2  # in units of the object's longest side
-STATES = ("pair", "object", "rotation", "translation", "chosen", "answer")
+STATES = ("pair", "object", "rotation", "translation", "chosen", "answer", "probability")
 
 
 class SolvedBatch(NamedTuple):
@@ -26,6 +26,7 @@ class SolvedBatch(NamedTuple):
     translation: Tensor  # [P, N] float64, scene units
     chosen: Tensor  # [P] int64
     answer: Tensor  # [P, 3] float64
+    probability: Tensor  # [P] float64, of the answer to be within 30 degrees; NaN where the model tells none
     seconds: float
     passes: int
 

@@ -99,7 +99,7 @@ def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, 
 
 PAIR_COLUMNS = (
     "object", "ambiguity", "reference", "query", "rotation_error_degrees", "translation_error", "chosen_start",
-    "latitude_degrees", "longitude_degrees", "relative_radius",
+    "latitude_degrees", "longitude_degrees", "relative_radius", "probability",
 )  # fmt: skip
 
 
@@ -114,5 +114,7 @@ def pair_rows(metrics: PoseMetrics, table: ViewTable) -> list[list[object]]:
         errors = [round(float(rows[key][line, chosen]), 5) for key in ("rotation", "translation")]
         pose = [round(math.degrees(latitude), 4), round(math.degrees(longitude), 4), round(radius, 5)]
         files = [table.files[reference].name, table.files[query].name]
-        lines.append([table.names[index], table.ambiguities[index], *files, *errors, chosen, *pose])
+        probability = float(rows["probability"][line])
+        sure = "" if math.isnan(probability) else round(probability, 4)
+        lines.append([table.names[index], table.ambiguities[index], *files, *errors, chosen, *pose, sure])
     return lines
