@@ -1,0 +1,123 @@
+"""What all pairs of several views tell together of where the views are: the paper's joint reasoning on densities.
+
+A pair's density has several modes, and which one is right, the pair often cannot tell. All pairs can: longitudes of the
+views that are right agree with every pair. So hypotheses of all longitudes are drawn along trees of pairs, each climbs
+to the nearest maximum of the sum of all pairs' log-densities, and a view's density is the mixture over the maxima of
+what the other views, there, tell of it. Pairs that share views err alike: together they count for more than one pair,
+and for less than as many independent ones.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from lp_framework.keyed_random import keyed_uniform
+from lp_framework.models.pose_density import GRID, PoseDensity
+
+HYPOTHESES = 64
+SWEEPS = 10  # of all views, each moved to its best longitude given the others
+DEPENDENCE = 0.7  # at 0 V - 1 pairs would be independent, at 1 they would tell no more than one
+_TREES = 0x4A4F  # separates these draws from others under the same seed
+
+
+def joint_density(density: PoseDensity, sets: int, ids: Tensor, seed: int) -> PoseDensity:
+    """The densities of S x (V - 1) views relative to the first, from those of all ordered pairs `[S x V x (V - 1)]`
+    (by reference, then query); `ids` `[S]` of the sets, by which `seed` draws."""
+    views = round((1 + math.sqrt(1 + 4 * len(density.logits) / sets)) / 2)
+    told = _table(density.logits.log_softmax(dim=-1), sets, views)
+    told = (told + _reversed(told.transpose(1, 2))) / 2
+    places = _climbed(told, _drawn(told, ids, seed))
+    mean, deviation = _agreed(
+        _table(density.mean, sets, views), _table(density.deviation.square().reciprocal(), sets, views)
+    )
+    return PoseDensity(_mixture(told, places).flatten(0, 1), mean.flatten(0, 1), deviation.flatten(0, 1), density.sigma)
+
+
+def _table(values: Tensor, sets: int, views: int) -> Tensor:
+    """Values `[S x V x (V - 1), C]` of ordered pairs as `[S, V, V, C]`, 0 on the diagonal."""
+    table = values.new_zeros(sets, views, views, values.shape[-1])
+    off = ~torch.eye(views, dtype=torch.bool, device=values.device)
+    table[:, off] = values.unflatten(0, (sets, -1))
+    return table
+
+
+def _reversed(density: Tensor) -> Tensor:
+    """Log-densities `[..., GRID]` of the longitudes' negatives."""
+    return density.flip(-1).roll(1, -1)
+
+
+def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:
+    """Longitudes `[S, H, V]` (numbers of the grid) along trees of pairs that are drawn, sure pairs sooner, each pair's
+    longitude by its density."""
+    sets, views = told.shape[:2]
+    uniform = keyed_uniform(
+        seed, _TREES, ids[:, None, None], torch.arange(HYPOTHESES)[:, None], torch.arange(views - 1), count=2
+    ).to(told)
+    peak = told.exp().amax(dim=-1)[:, None].expand(-1, HYPOTHESES, -1, -1)
+    cumulated = told.exp().cumsum(dim=-1)
+    placed = torch.zeros(sets, HYPOTHESES, views, dtype=torch.bool, device=told.device)
+    placed[..., 0] = True
+    places = torch.zeros(sets, HYPOTHESES, views, dtype=torch.long, device=told.device)
+    row, column = torch.meshgrid(
+        torch.arange(sets, device=told.device), torch.arange(HYPOTHESES, device=told.device), indexing="ij"
+    )
+    for step in range(views - 1):
+        weight = (peak * placed[..., None] * ~placed[..., None, :]).flatten(2).cumsum(dim=-1)
+        pair = torch.searchsorted(weight, uniform[:, :, step, :1] * weight[..., -1:]).squeeze(-1)
+        known, new = pair // views, pair % views
+        cells = cumulated[row, known, new]
+        turn = torch.searchsorted(cells, uniform[:, :, step, 1:] * cells[..., -1:]).squeeze(-1)
+        places[row, column, new] = (places[row, column, known] + turn) % GRID
+        placed[row, column, new] = True
+    return places
+
+
+def _given_others(told: Tensor, places: Tensor, view: int) -> Tensor:
+    """Sums over the other views of what their pairs tell of `view`, `[S, H, GRID]`."""
+    turn = (torch.arange(GRID, device=told.device) - places[..., None]) % GRID  # [S, H, V, GRID]
+    of_view = told[:, None, :, view].expand(-1, places.shape[1], -1, -1)
+    return of_view.gather(-1, turn).sum(dim=2) - of_view[:, :, view].gather(-1, turn[:, :, view])
+
+
+def _climbed(told: Tensor, places: Tensor) -> Tensor:
+    """Every hypothesis at a maximum: no view alone can be moved to a better longitude, or `SWEEPS` are over."""
+    for _ in range(SWEEPS):
+        before = places.clone()
+        for view in range(1, told.shape[1]):
+            places[..., view] = _given_others(told, places, view).argmax(dim=-1)
+        if torch.equal(before, places):
+            break
+    return places
+
+
+def _mixture(told: Tensor, places: Tensor) -> Tensor:
+    """Log-densities `[S, V - 1, GRID]` of the views but the first."""
+    _, hypotheses, views = places.shape
+    turn = (places[:, :, None] - places[..., None]) % GRID  # [S, H, V, V]
+    at = told[:, None].expand(-1, hypotheses, -1, -1, -1).gather(-1, turn[..., None])[..., 0]
+    witnesses = (views - 1) ** DEPENDENCE
+    score = at.sum(dim=(2, 3)) / 2 / witnesses  # the diagonal is 0
+    same = (places[:, :, None] == places[:, None]).all(dim=-1).tril(-1).any(dim=-1)  # as an earlier one
+    share = score.masked_fill(same, -torch.inf).log_softmax(dim=-1)[..., None]
+    others = [
+        (share + (_given_others(told, places, view) / witnesses).log_softmax(dim=-1)).logsumexp(dim=1)
+        for view in range(1, views)
+    ]
+    return torch.stack(others, dim=1)
+
+
+def _agreed(mean: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+    """Least squares of latitude and radius: values and deviations `[S, V - 1, 2]` relative to the first view, from the
+    differences `[S, V, V, 2]` of ordered pairs; deviations as of one witness, see above."""
+    views = mean.shape[1]
+    weight = (precision + precision.transpose(1, 2)).movedim(-1, 1)  # [S, 2, V, V]
+    weight = weight * ~torch.eye(views, dtype=torch.bool, device=mean.device)
+    pull = (precision * mean - (precision * mean).transpose(1, 2)).movedim(-1, 1).sum(dim=2)  # [S, 2, V]
+    normal = torch.diag_embed(weight.sum(dim=-1)) - weight
+    inverse = torch.linalg.inv(normal[..., 1:, 1:].double())
+    values = (inverse @ pull[..., 1:, None].double())[..., 0]
+    variance = views * inverse.diagonal(dim1=-2, dim2=-1)
+    return values.movedim(1, -1).to(mean), variance.sqrt().movedim(1, -1).to(mean)
