@@ -56,7 +56,7 @@ def away(poses: Tensor, true: Tensor) -> Tensor:
 class ExactModel:
     """A score model of `ExactPrior`'s images: s(x) = truth - x, the score of the line's kernel at sigma 1."""
 
-    has_energy, sigma, choose_by = False, 1.0, "distance"
+    has_energy, has_density, sigma, choose_by = False, False, 1.0, "distance"
 
     def encode(self, images: Tensor) -> Tensor:
         return images.flatten(1)[:, :3]

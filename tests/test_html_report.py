@@ -151,7 +151,7 @@ def replace(folder: Path, old: str, new: str) -> None:
 class Tells(torch.nn.Module):
     """A score model that reads the pose off the image as `ExactPrior` does."""
 
-    has_energy, sigma, choose_by = False, 1.0, "distance"
+    has_energy, has_density, sigma, choose_by = False, False, 1.0, "distance"
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
         return images.flatten(1)[:, :3]

@@ -21,7 +21,7 @@ ALPHA = 0.1
 class Exact:
     """s(x) = (truth - x) / sigma^2: the line's score. The first three numbers of an image are its pose."""
 
-    has_energy, choose_by = False, "distance"
+    has_energy, has_density, choose_by = False, False, "distance"
 
     def __init__(self, sigma: float = 1.0) -> None:
         self.sigma = sigma

@@ -1,9 +1,11 @@
 """The matching model: votes, mirrored maps, where its density leads solvers, and what its training is taught by."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
+from exact_prior import ExactPrior
 
 from lp_framework.errors import UserError
 from lp_framework.models.backbones import EfficientNetLite0, EfficientNetLite0Maps
@@ -11,8 +13,9 @@ from lp_framework.models.matching import MatchingModel
 from lp_framework.models.matching_network import BINS, HARMONICS, MOMENTS, ViewCells, Voting
 from lp_framework.models.pose_density import GRID, PoseDensity
 from lp_framework.models.pose_model import ScoreModel
-from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.base import Pairs, ViewSets
 from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.multiview import MultiView
 from lp_framework.solvers.starts import Modes
 
 TURN = 2 * math.pi
@@ -137,16 +140,70 @@ def test_each_mode_keeps_its_valley_at_little_smoothing_and_energy_chooses(told:
     assert solution.chosen.tolist() == [1]
 
 
-def test_ends_come_with_their_probability_more_even_than_the_density(told: TwoValleys):
+def test_ends_come_with_their_probability(told: TwoValleys):
     starts = Modes(told, count=2).make(a_pair(), seed=0)
     solution = Langevin(told, gamma=0.0, sigma=0.15).solve(a_pair(), starts, seed=0)
+    assert solution.probability is not None
+    assert solution.probability[0].tolist() == pytest.approx([0.6, 0.4], abs=0.02)
     density = told.condition(torch.zeros(1, 1), torch.zeros(1, 1))
-    assert density[:, None].probability(solution.poses, 30.0)[0].tolist() == pytest.approx([0.6, 0.4], abs=0.02)
-    assert solution.probability is not None and solution.probability.shape == (1, 2)
-    first, second = solution.probability[0].tolist()
-    assert 0.35 < second < first < 0.58
     wide = told.probability(density[:, None], solution.poses, degrees=120.0)
     assert (wide > solution.probability).all() and (wide <= 1).all()
+
+
+class Undecided(TwoValleys):
+    """Told the longitudes of views by their images; pairs that are far apart prefer half a turn more."""
+
+    def encode(self, images):
+        return images[:, 0, 0, 0]
+
+    def condition(self, reference, query):
+        turn = query - reference
+        share = torch.where(turn.cos() < 0.0, 0.4, 0.95)[:, None]
+        grid = torch.arange(GRID) * TURN / GRID
+        right, other = (torch.exp(30 * (grid - turn[:, None] - shift).cos() - 30) for shift in (0.0, math.pi))
+        logits = (share * right + (1 - share) * other).log()
+        return PoseDensity(logits, torch.zeros(len(turn), 2), torch.full((len(turn), 2), 0.1), self.sigma)
+
+
+@pytest.mark.parametrize("solver", ["langevin", "multiview"])
+def test_several_views_decide_what_a_pair_gets_wrong(solver: str):
+    model = Undecided(EfficientNetLite0Maps(), width=32, layers=1)
+    longitudes = torch.tensor([0.0, 60.0, 120.0, 180.0]).deg2rad()
+    images = longitudes[:, None, None, None].expand(-1, 3, 8, 8)
+    sets = ViewSets(images, torch.arange(4)[None], torch.tensor([7]))
+    settings = {"langevin": {"gamma": 0.0, "sigma": 0.15}, "multiview": {"gamma": 0.0, "second_stage": False}}[solver]
+    build = {"langevin": Langevin, "multiview": partial(MultiView, prior=ExactPrior())}[solver]
+    modes = Modes(model, count=2)
+    pairs = modes.make(sets.with_first(), seed=0)
+    assert pairs[:, 0, 1].rad2deg().tolist() == pytest.approx([60, 300, 0], abs=1.5)  # the second and third are wrong
+    found = build(model, **settings).solve_views(sets, pairs[None], seed=0)
+    assert found.poses[0, :, 1].rad2deg().tolist() == pytest.approx([60, 120, 180], abs=1.5)
+    if solver == "langevin":
+        assert found.pairs is not None and found.pairs.probability is not None
+        assert (found.pairs.probability[:, 0] < found.pairs.probability.amax(dim=1))[1:].all()
+
+
+def test_a_mirror_image_has_the_mirrored_density(model: MatchingModel):
+    maps = model.backbone.trunk(2 * torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0)) - 1)
+    with torch.no_grad():
+        views, mirrored = model._encode(maps), model._encode(model.backbone.mirrored(maps))
+        one, other = (model.condition(each[torch.tensor([0])], each[torch.tensor([1])]) for each in (views, mirrored))
+    torch.testing.assert_close(
+        other.logits.log_softmax(-1), one.logits.log_softmax(-1).flip(-1).roll(1, -1), rtol=0, atol=1e-4
+    )
+    torch.testing.assert_close(other.mean, one.mean, rtol=0, atol=1e-5)
+
+
+def test_temperature_evens_the_density(model: MatchingModel):
+    images = 2 * torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
+    hot = MatchingModel(EfficientNetLite0Maps(), width=32, layers=1, cells=64, temperature=2.0).eval()
+    hot.load_state_dict(model.state_dict())
+    with torch.no_grad():
+        logits = []
+        for each in (model, hot):
+            codes = each.encode(images)
+            logits.append(each.condition(codes[torch.tensor([0])], codes[torch.tensor([1])]).logits.log_softmax(-1))
+    torch.testing.assert_close(logits[1], (logits[0] / 2).log_softmax(-1), rtol=0, atol=1e-5)
 
 
 def test_other_models_refuse_what_they_do_not_know():

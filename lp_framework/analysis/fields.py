@@ -65,7 +65,7 @@ class ExactModel(nn.Module):
     def __init__(self, kernel: PoseKernel, truth: Tensor, has_energy: bool = False) -> None:
         super().__init__()
         self.kernel, self.truth, self.has_energy, self.sigma = kernel, truth, has_energy, kernel.sigma
-        self.choose_by = PoseModel.choose_by
+        self.choose_by, self.has_density = PoseModel.choose_by, False
 
     def encode(self, images: Tensor) -> Tensor:
         """No features are needed: `[I, 1]`."""

@@ -31,9 +31,6 @@ NEAR_AXIS = 0.35  # scene units: distance from the upright axis within which a p
 MEAN_RADIUS = 1.6
 SMALLEST_DEVIATION, LARGEST_DEVIATION = 0.05, 3.0  # of latitude and radius, in units of POSE_SCALE
 SAME_POINT = 0.05  # scene units: standard deviation of the distance between two matching cells' points
-# Densities are too sure of objects never met. Of procedural objects outside the training 1.5 would make them right, of
-# others, whose pictures differ more from those of the training, 2 to 3.
-TEMPERATURE = 2.0
 OVERLAPPING = 1.75  # radians: pairs farther apart in longitude see too few points together to learn matches from
 
 
@@ -50,7 +47,7 @@ class MatchingModel(PoseModel):
     """
 
     backbone: EfficientNetLite0Maps
-    has_energy, choose_by, carries = True, "energy", ("points",)
+    has_energy, has_density, choose_by, carries = True, True, "energy", ("points",)
     pose_scale: Tensor
 
     def __init__(
@@ -121,7 +118,7 @@ class MatchingModel(PoseModel):
         return replace(condition, sigma=sigma)
 
     def probability(self, condition: PoseDensity, pose: Tensor, degrees: float = 30.0) -> Tensor:
-        return replace(condition, logits=condition.logits / TEMPERATURE).probability(pose, degrees)
+        return condition.probability(pose, degrees)
 
     def modes(self, condition: PoseDensity, count: int) -> Tensor:
         """The highest maxima of the longitude's density, at the latitude's and radius's means, `[P, count, 3]`."""
@@ -130,6 +127,7 @@ class MatchingModel(PoseModel):
         return torch.stack([latitude, longitude, radius], dim=-1)
 
     def _encode(self, maps: Tensor) -> ViewCells:
+        maps = maps.float()  # cached as float16, which autocast to bfloat16 does not stack
         both = torch.stack([maps, self.backbone.mirrored(maps)], dim=1).flatten(0, 1)
         features, coverage, cells = self._foremost(both, self.cells)
         return self.encoder(self._standardised(features, coverage), coverage, cells)[0].unflattened(2)
@@ -177,8 +175,8 @@ class MatchingModel(PoseModel):
         cropped = batch.cropped.to(reference.device)
         losses = {
             "longitude": -density.log_prob(true[:, 1]).mean(),
-            "shift": 0.3 * self._shift_loss(density, true, cropped[reference] | cropped[query]),
-            "view": 0.3 * self._view_loss(views, poses, cropped),
+            "shift": 0.5 * self._shift_loss(density, true, cropped[reference] | cropped[query]),
+            "view": 0.5 * self._view_loss(views, poses, cropped),
             **self._geometry_losses(views, told_points, _taken(points, cells), poses, reference, query),
         }
         for name, value in losses.items():

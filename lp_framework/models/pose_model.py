@@ -45,6 +45,7 @@ class PoseModel(TrainedModule):
     sigma: float  # radians and scene units: the field's score is (truth - x) / sigma^2 near an only truth
     kernel: PoseKernel  # of the noise
     has_energy: bool  # whether `field` gives an energy beside the score
+    has_density = False  # whether conditions are `PoseDensity`, normalised and known at every sigma
     choose_by: Literal["distance", "energy"] = "distance"  # what tells the best of several ends, see solver=langevin
 
     @abstractmethod

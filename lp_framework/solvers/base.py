@@ -161,15 +161,19 @@ class Solver(ABC):
         Unless a solver reasons about all views together, each pair with the first view is solved for itself.
         """
         check_starts(view_sets, starts)
-        sets, views = view_sets.views.shape
-        solution = self.solve(view_sets.with_first(), starts.flatten(0, 1), seed)
-        chosen = solution.chosen[:, None]
-        energies = solution.energies.new_full((sets, views, views), torch.nan)
-        energies[:, 0, 1:] = solution.energies.gather(1, chosen).view(sets, views - 1)
-        return ViewSolution(
-            poses=solution.answer().view(sets, views - 1, 3),
-            energies=energies,
-            valid=solution.valid.gather(1, chosen).view(sets, views - 1).all(dim=1),
-            cost=solution.cost,
-            pairs=solution,
-        )
+        return of_first_views(view_sets, self.solve(view_sets.with_first(), starts.flatten(0, 1), seed))
+
+
+def of_first_views(view_sets: ViewSets, solution: Solution) -> ViewSolution:
+    """The solution of sets from that of their pairs with the first view."""
+    sets, views = view_sets.views.shape
+    chosen = solution.chosen[:, None]
+    energies = solution.energies.new_full((sets, views, views), torch.nan)
+    energies[:, 0, 1:] = solution.energies.gather(1, chosen).view(sets, views - 1)
+    return ViewSolution(
+        poses=solution.answer().view(sets, views - 1, 3),
+        energies=energies,
+        valid=solution.valid.gather(1, chosen).view(sets, views - 1).all(dim=1),
+        cost=solution.cost,
+        pairs=solution,
+    )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from itertools import permutations
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -15,7 +16,18 @@ from lp_framework.geometry import reduce_longitude, wrap_angle
 from lp_framework.keyed_random import keyed_normal
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
+from lp_framework.solvers.base import (
+    Cost,
+    Pairs,
+    Solution,
+    Solver,
+    ViewSets,
+    ViewSolution,
+    check_starts,
+    choose,
+    of_first_views,
+)
+from lp_framework.solvers.joint_density import joint_density
 from lp_framework.solvers.progress import steps_of
 
 
@@ -61,7 +73,25 @@ class Langevin(Solver):
         check_starts(pairs, starts)
         began = now(starts.device)
         codes = self.model.encode(pairs.images)
-        condition = self.model.condition(codes[pairs.reference], codes[pairs.query])[:, None]  # [B, 1, ...]
+        condition = self.model.condition(codes[pairs.reference], codes[pairs.query])
+        return self._descend(condition, pairs, starts, seed, began)
+
+    @torch.no_grad()
+    def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
+        """See `Solver.solve_views`. Of a model with densities, those of all ordered pairs are combined."""
+        if not self.model.has_density:
+            return super().solve_views(view_sets, starts, seed)
+        check_starts(view_sets, starts)
+        began = now(starts.device)
+        codes = self.model.encode(view_sets.images)
+        pairs = view_sets.pairs(*zip(*permutations(range(view_sets.views.shape[1]), 2), strict=True))
+        condition = self.model.condition(codes[pairs.reference], codes[pairs.query])
+        joint = joint_density(condition, len(view_sets), view_sets.ids, seed)
+        solution = self._descend(joint, view_sets.with_first(), starts.flatten(0, 1), seed, began)
+        return of_first_views(view_sets, solution)
+
+    def _descend(self, condition: Any, pairs: Pairs, starts: Tensor, seed: int, began: float) -> Solution:
+        condition = condition[:, None]  # [B, 1, ...]
         noise = self._noise(pairs, starts, seed)
         pose, trajectory = starts, [starts]
         ratio = 1.0

@@ -22,6 +22,7 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
 from lp_framework.solvers.twist import DescentSettings, TanhRadius, TwistPoses
 
+SHARP = 0.15  # radians, scene units: smoothing at which the modes of a density stay apart
 NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model does not tell it
 
 
@@ -40,10 +41,10 @@ class MultiView(Solver):
     """Joint reasoning over 2 to 8 images: pairwise first stage, a robust fit of absolute poses, joint refinement.
 
     All ends of the first stage are measurements for the fit, weighted by 1 / (d^2 + 0.1^2), with d the distance to the
-    truth that the model tells there (`choose_by=distance` of `langevin`), or, where the model has a density, by that
-    density. Without `first_stage` the second descends
-    from the starts themselves, number n of all images together, and the answer has the least energy on `rescoring`
-    noises and timesteps, the same for all. A pair is a set of two.
+    truth that the model tells there (`choose_by=distance` of `langevin`). Where the model has densities, those of all
+    pairs are combined instead, as `langevin` does for sets. Without `first_stage` the second descends from the starts
+    themselves, number n of all images together, and the answer has the least energy on `rescoring` noises and
+    timesteps, the same for all. A pair is a set of two.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class MultiView(Solver):
         check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 1, "at least 1"))
         self.model, self.prior = model, prior
         self.first_stage, self.second_stage = first_stage, second_stage
-        self.first = Langevin(model, alpha, gamma, iterations)
+        self.first = Langevin(model, alpha, gamma, iterations, sigma=SHARP if model.has_density else None)
         self.second = DescentSettings(
             refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, "rescored", rescoring
         )
@@ -107,7 +108,10 @@ class MultiView(Solver):
     @torch.no_grad()
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
         """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
-        if self.first_stage:
+        if self.first_stage and self.model.has_density:
+            found = self.first.solve_views(view_sets, starts, seed)
+            poses, valid, passes = found.poses[:, None], found.valid[:, None], found.cost.network_passes
+        elif self.first_stage:
             measured, weights, passes = self.measure(view_sets, starts, seed)
             poses, valid = self.fit(measured, weights)
         else:
@@ -131,8 +135,7 @@ class MultiView(Solver):
         poses[:, reference, query] = solution.poses.unflatten(0, (sets, -1))
         weights = torch.zeros_like(poses[..., 0])
         told = solution.energies.unflatten(0, (sets, -1))
-        by_density = self.first.choose_by == "energy"
-        weights[:, reference, query] = (-told).exp() if by_density else 1 / (told.square() + NEAREST**2)
+        weights[:, reference, query] = 1 / (told.square() + NEAREST**2)
         return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
     def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
