@@ -286,7 +286,8 @@ def journal(tmp_path_factory) -> tuple[Path, dict, SolvedBatch]:
     subject = {key: value for key, value in SUBJECT.items() if key != "views"}
     rows = {name: torch.arange(4.0).view(2, 2).double() for name in ("rotation", "translation", "answer")}
     pair, numbers = torch.tensor([[3, 4], [5, 3]]), {name: torch.tensor([3, 5]) for name in ("object", "chosen")}
-    batch = SolvedBatch(pair, **numbers, **rows, seconds=0.5, passes=3)
+    sure = torch.tensor([0.5, math.nan], dtype=torch.float64)
+    batch = SolvedBatch(pair, **numbers, **rows, probability=sure, seconds=0.5, passes=3)
     begun = Journal(folder, subject)
     assert begun.begin("a") == []
     begun.append(batch, 0)

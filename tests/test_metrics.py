@@ -113,7 +113,8 @@ def rows(pairs: int = 60, starts: int = 3, seed: int = 0) -> tuple[torch.Tensor,
     pair = torch.stack([number // 32, number % 32], dim=1)
     rotation, translation, chosen = errors(pairs, starts, seed)
     answer = torch.from_numpy(random.normal(size=(pairs, 3)))
-    return pair, torch.from_numpy(random.integers(4, size=pairs)), rotation, translation, chosen, answer
+    probability = torch.from_numpy(random.uniform(size=pairs))
+    return pair, torch.from_numpy(random.integers(4, size=pairs)), rotation, translation, chosen, answer, probability
 
 
 def solved(given: tuple[torch.Tensor, ...]) -> SolvedBatch:

@@ -308,7 +308,7 @@ def solved(pairs: int = 4, starts: int = 3) -> SolvedBatch:
     rotation[0, 0], translation[0, 0], translation[0, 1] = torch.nan, torch.inf, 5e-324
     numbers, answer = torch.arange(pairs), torch.rand(pairs, 3).double() / 3
     pair = torch.stack([numbers, numbers + 1], dim=1)
-    return SolvedBatch(pair, numbers % 2, rotation, translation, numbers % starts, answer, 0.1, 12)
+    return SolvedBatch(pair, numbers % 2, rotation, translation, numbers % starts, answer, answer[:, 0], 0.1, 12)
 
 
 def test_a_journal_gives_back_every_bit(tmp_path):

@@ -88,6 +88,7 @@ def evaluate_idpose(results: str | Path, views: str | Path) -> dict[str, Any]:
             translation=translation_error(predicted, query)[:, None],
             chosen=torch.zeros(len(pairs), dtype=torch.int64),
             answer=poses,
+            probability=torch.full((len(pairs),), torch.nan, dtype=torch.float64),
             seconds=0.0,
             passes=0,
         )
