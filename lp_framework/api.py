@@ -43,8 +43,8 @@ def estimate_pose(
     latitude and longitude (radians, the latter in [0, 2 pi)) and radius (object sizes), query minus reference.
 
     A picture is a file, an image of Pillow or an array `[H, W, 3 | 4]` (uint8, or floats in [0, 1]). It is prepared as
-    `data.photographs` says: cut out by its alpha channel, or by rembg with `remove_background`, centred and scaled.
-    With `crop=False` it is a whole square view, on white where it has no alpha channel.
+    `data.photographs` says: cut out by its alpha channel, or by a mask made with `remove_background`, centred and
+    scaled. With `crop=False` it is a whole square view, on white where it has no alpha channel.
 
     `solver`, `prior` and `starts` are registered names or objects built by the functions below. A name gets the prior
     and the model that it asks for (`model` is weights that ship, a checkpoint, a run's folder or a model) on the GPU,

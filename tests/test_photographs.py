@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lp_framework.data.cache import decoded_views
+from lp_framework.data.masks import mask_maker
 from lp_framework.data.photographs import (
     EXTENT,
     SIZE,
-    _background_remover,
     array_image,
     crop_to_object,
     cut_out,
@@ -28,6 +28,7 @@ from lp_framework.data.photographs import (
     photograph_files,
     prepare,
     read_image,
+    read_photographs,
     upright,
 )
 from lp_framework.errors import UserError
@@ -357,9 +358,9 @@ def rembg(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
 
     module.new_session, module.remove = new_session, remove  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "rembg", module)
-    _background_remover.cache_clear()
+    mask_maker.cache_clear()
     yield module
-    _background_remover.cache_clear()
+    mask_maker.cache_clear()
 
 
 def test_the_background_is_removed_where_nothing_else_tells(rembg):
@@ -382,16 +383,63 @@ def test_what_can_go_wrong_with_background_removal(rembg, monkeypatch: pytest.Mo
     with pytest.raises(UserError, match="a: its mask is empty"):
         prepare(Image.new("RGB", (60, 40)), "a", remove_background=True)
 
+
+def on_a_table(red: int = 200, size: int = 300) -> tuple[Image.Image, NDArray[np.bool_]]:
+    """A photograph of an ellipse before a textured background, and where it is."""
+    noise = np.random.default_rng(0).integers(150, 190, (size, size, 3), dtype=np.uint8)
+    y, x = np.mgrid[:size, :size]
+    shown = np.hypot((x - 0.5 * size) / 0.3, (y - 0.55 * size) / 0.2) < size
+    return Image.fromarray(np.where(shown[..., None], np.uint8([red, 40, 30]), noise)), shown
+
+
+def test_without_rembg_or_its_weights_a_rough_mask_is_made_and_said_once(rembg, monkeypatch, caplog, tmp_path: Path):
     def offline(name: str) -> None:
         raise ConnectionError("no route to host")
 
-    _background_remover.cache_clear()
+    mask_maker.cache_clear()
     rembg.new_session = offline
-    with pytest.raises(UserError, match=r"the weights of rembg's u2net cannot be had \(no route to host\)"):
-        prepare(Image.new("RGB", (60, 40)), "a", remove_background=True)
+    image, shown = on_a_table()
+    files = [saved(image, tmp_path / "a.png"), saved(image.convert("RGBA"), tmp_path / "b.png")]
+    for photograph in read_photographs(files, None, remove_background=True, crop=True):
+        assert photograph.made and photograph.mask.size == image.size
+        mask = np.asarray(photograph.mask) >= 128
+        assert (mask & shown).sum() > 0.97 * (mask | shown).sum()
+        assert np.array_equal(photograph.prepared(True), prepare(image, "a", remove_background=True))
+    (said,) = caplog.messages
+    assert "GrabCut, since rembg cannot get its weights (no route to host); an alpha channel, masks=FOLDER" in said
+
     monkeypatch.setitem(sys.modules, "rembg", None)  # as if not installed
-    with pytest.raises(UserError, match=r"remove_background=true needs rembg: pip install 'lp_framework\[masks\]'"):
-        prepare(Image.new("RGB", (60, 40)), "a", remove_background=True)
+    mask_maker.cache_clear()
+    caplog.clear()
+    assert prepare(image, "a", remove_background=True).getpixel((0, 0))[3] == 0
+    assert "since rembg is not installed (pip install 'lp_framework[masks]')" in caplog.text
+
+
+def test_masks_are_not_made_where_there_are_any(rembg, tmp_path: Path):
+    cut = saved(placed(drawn(), 20, 30), tmp_path / "a.png")
+    plain = saved(placed(drawn(), 20, 30).convert("RGB"), tmp_path / "b.png")
+    (tmp_path / "masks").mkdir()
+    saved(placed(drawn(), 20, 30).getchannel("A"), tmp_path / "masks" / "b.png")
+    read = read_photographs([cut, plain], tmp_path / "masks", remove_background=True, crop=True)
+    assert [each.made for each in read] == [False, False] and rembg.sessions == []
+
+
+@pytest.mark.parametrize("size", [(3, 3), (60, 40), (900, 1400)])
+def test_a_picture_of_one_colour_has_no_rough_mask(rembg, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]):
+    monkeypatch.setitem(sys.modules, "rembg", None)
+    mask_maker.cache_clear()
+    with pytest.raises(UserError, match=r"a: (its mask is empty|GrabCut finds no background|the object is 1 pixels)"):
+        prepare(Image.new("RGB", size, (90, 120, 40)), "a", remove_background=True)
+
+
+def test_an_object_that_the_border_cuts_off_is_told(caplog):
+    whole, cut = placed(drawn(80, 60), 0, 40), placed(drawn(80, 60), -20, 40)
+    prepare(whole, "whole.png")
+    assert caplog.messages == []  # it touches the border
+    prepare(cut, "cut.png")
+    assert caplog.messages == [
+        "cut.png: the image's border seems to cut the object off; an answer wants all of it in the picture"
+    ]
 
 
 # ---------------------------------------------------------------- cut-outs as they are published

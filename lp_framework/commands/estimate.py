@@ -20,7 +20,8 @@ from torch import Tensor
 from lp_framework.analysis.confidence import NEAR_DEGREES, Answer, answers
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
-from lp_framework.data.photographs import SIZE, photograph_files, prepared_photographs, save_png
+from lp_framework.data.masks import mask_maker
+from lp_framework.data.photographs import SIZE, photograph_files, read_photographs, save_png
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, colmap_model, nerf_transforms
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
@@ -37,6 +38,7 @@ COLUMNS = (
     "relative_longitude_degrees", "relative_radius", "energy", "valid", "answer", "probability", "verdict",
     "second_latitude_degrees", "second_longitude_degrees", "second_probability",
 )  # fmt: skip
+MASKS = "masks"  # folder of the masks that a run has made
 RADIUS_LOST = "the crop to the object loses the distance: radius is not estimated"
 
 
@@ -45,7 +47,8 @@ def run(config: DictConfig) -> None:
     folder, device, components = begin(config)
     first = _reference_pose(config.latitude_degrees, config.radius)
     files = photograph_files(config.images)
-    prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
+    photographs = read_photographs(files, config.masks, config.remove_background, config.crop)
+    prepared = [each.prepared(config.crop) for each in photographs]
     warn_of_unused(components)
     solver, starts = components["solver"], components["start"]
     move(solver, device)
@@ -67,13 +70,18 @@ def run(config: DictConfig) -> None:
         "network_passes": solution.cost.network_passes,
         "energies": energies.tolist(),
         "valid": bool(solution.valid[0]),
+        "masks_by": mask_maker().name if any(each.made for each in photographs) else None,
         "answers": [_record(file, answer) for file, answer in zip(files[1:], told, strict=bool(told))],
         "checkpoint": str(components.checkpoint) if components.checkpoint else None,
         **components.record(),
     }
     write_json(folder / "results.json", result)
+    for index, photograph in enumerate(photographs):
+        if photograph.made and photograph.mask is not None:
+            (folder / MASKS).mkdir(exist_ok=True)
+            save_png(folder / MASKS / f"{index:03d}.png", photograph.mask)
     rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist(), told)
-    _print(folder, rows, told, radius_lost)
+    _print(folder, rows, told, radius_lost, result["masks_by"] is not None)
     warn_of_prior(components)
 
 
@@ -152,7 +160,9 @@ def _notes(answer: Answer) -> list[Any]:
     return [answer.words, round(answer.probability, 4), answer.verdict, *second]
 
 
-def _print(folder: Path, rows: Sequence[Sequence[Any]], told: Sequence[Answer], radius_lost: bool) -> None:
+def _print(
+    folder: Path, rows: Sequence[Sequence[Any]], told: Sequence[Answer], radius_lost: bool, masks_made: bool
+) -> None:
     """The rows of `poses.csv` for people, and where everything is."""
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -177,5 +187,7 @@ def _print(folder: Path, rows: Sequence[Sequence[Any]], told: Sequence[Answer], 
     console.print(f"poses:   {folder}/transforms.json, poses.csv", soft_wrap=True)
     console.print(f"COLMAP:  {folder}/colmap", soft_wrap=True)
     console.print(f"images:  {folder}/images", soft_wrap=True)
+    if masks_made:
+        console.print(f"masks:   {folder}/{MASKS}", soft_wrap=True)
     console.print(f"picture: {folder}/cameras.png", soft_wrap=True)
     console.print(f"page:    {write_run_page(folder, 'estimate')}", soft_wrap=True)

@@ -1,6 +1,6 @@
 """Photographs of one object, prepared as the priors and models know views: upright, cut out, centred, square, on white.
 
-Where the object is, an image's own alpha channel says, a mask file, or rembg. The crop is that of Zero123's demo
+Where the object is, an image's own alpha channel says, a mask file, or `data.masks`. The crop is that of Zero123's demo
 (`load_and_preprocess`): the longest side of the object's bounding box becomes 200 of the image's 256 pixels, its centre
 the image's. Background is what is less than half opaque, as in the code of iFusion and ID-Pose.
 
@@ -11,12 +11,12 @@ the photograph's, distance and focal length are lost, and a relative radius comp
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,11 +24,15 @@ from PIL import Image, ImageOps
 
 from lp_framework.atomic import written
 from lp_framework.data.files import expecting
+from lp_framework.data.masks import mask_maker
 from lp_framework.errors import UserError
+
+log = logging.getLogger(__name__)
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
 HALF = 128  # opacity, of 255, from which on a pixel is the object's
 SMALLEST = 16  # pixels; a smaller object in a photograph says too little
+CUT_OFF = 0.1  # of the object's longest side: along the border, so much of it is no touch but a cut
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
@@ -103,20 +107,6 @@ def array_image(array: ArrayLike, name: str) -> Image.Image:
     return Image.fromarray(values)
 
 
-@cache
-def _background_remover() -> Callable[[Image.Image], Image.Image]:
-    """The opacity ("L") of what is in an image, by rembg (MIT licence) with U^2-Net (Apache-2.0, 176 MB)."""
-    try:
-        from rembg import new_session, remove
-    except (ImportError, SystemExit):  # without onnxruntime it exits
-        raise UserError("remove_background=true needs rembg: pip install 'lp_framework[masks]'") from None
-    try:
-        session = new_session("u2net")  # its default network is not free for commercial use
-    except (OSError, ValueError) as error:
-        raise UserError(f"the weights of rembg's u2net cannot be had ({error})") from error
-    return partial(remove, session=session, only_mask=True)
-
-
 def cut_out(
     image: Image.Image,
     name: str,
@@ -124,7 +114,8 @@ def cut_out(
     remove_background: bool = False,
     required: bool = True,
 ) -> Image.Image:
-    """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else rembg.
+    """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else with
+    `remove_background` by a mask that is made.
 
     `UserError`, which calls the image `name`, for a mask of another size or without background, and where none of the
     three is to be had; that leaves the whole image opaque unless it is `required`.
@@ -142,9 +133,7 @@ def cut_out(
     elif image.mode == "RGBA":
         opacity = _opacity(image.getchannel("A"))
     if opacity is None and remove_background:
-        opacity = _opacity(_background_remover()(image.convert("RGB")))
-        if opacity is None:
-            raise UserError(f"{name}: rembg finds no background in it; give a mask")
+        opacity = _opacity(made_mask(image, name))
     if opacity is None and required:
         raise UserError(
             f"{name}: has no transparent background (alpha channel) and no mask; give masks=FOLDER or "
@@ -153,6 +142,15 @@ def cut_out(
     result = image.convert("RGB")
     result.putalpha(255 if opacity is None else opacity)
     return result
+
+
+def made_mask(image: Image.Image, name: str) -> Image.Image:
+    """A mask ("L") of an image's object, see `data.masks`; `UserError` where no background is found."""
+    maker = mask_maker()
+    mask = maker.mask(image.convert("RGB"))
+    if _opacity(mask) is None:
+        raise UserError(f"{name}: {maker.name} finds no background in it; give a mask")
+    return mask
 
 
 def _opacity(levels: Image.Image) -> Image.Image | None:
@@ -176,6 +174,11 @@ def crop_to_object(image: Image.Image, name: str) -> Image.Image:
     longest = max(right - left, bottom - top)
     if longest < SMALLEST:
         raise UserError(f"{name}: the object is {longest} pixels long, at least {SMALLEST} are needed")
+    opaque = np.asarray(image.getchannel("A")) >= HALF
+    if max(int(line.sum()) for line in (opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1])) > CUT_OFF * longest:
+        log.warning(
+            "%s: the image's border seems to cut the object off; an answer wants all of it in the picture", name
+        )
     side = longest * SIZE / EXTENT
     corners = np.array([left + right - side, top + bottom - side, left + right + side, top + bottom + side]) / 2
     whole = (*(math.floor(corner) for corner in corners[:2]), *(math.ceil(corner) for corner in corners[2:]))
@@ -196,20 +199,48 @@ def prepare(
     return whole.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
 
 
-def prepared_photographs(
+class Photograph(NamedTuple):
+    """An image file, read, with its mask, if any, and whether that was made here."""
+
+    name: str
+    image: Image.Image
+    mask: Image.Image | None
+    made: bool
+
+    def prepared(self, crop: bool) -> Image.Image:
+        """See `prepare`."""
+        return prepare(self.image, self.name, self.mask, crop=crop)
+
+
+def read_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
-) -> list[Image.Image]:
-    """Image files as `prepare` has them, with their masks from the folder `masks`; all are read before that begins."""
+) -> list[Photograph]:
+    """Image files with their masks from the folder `masks`, or, with `remove_background`, made for those that have
+    neither mask nor alpha channel; all are read before that begins."""
     for name, value in (("remove_background", remove_background), ("crop", crop)):
         if not isinstance(value, bool):
             raise UserError(f"{name} must be true or false, got {value}")
     found = mask_files(files, masks) if masks is not None else [None] * len(files)
     images = [read_image(file) for file in files]
-    cuts = [None if mask is None else read_image(mask) for mask in found]
-    return [
-        prepare(image, str(file), mask, remove_background, crop)
-        for file, image, mask in zip(files, images, cuts, strict=True)
+    read = [
+        Photograph(str(file), image, None if mask is None else read_image(mask), False)
+        for file, image, mask in zip(files, images, found, strict=True)
     ]
+    if not remove_background:
+        return read
+    return [
+        each._replace(mask=made_mask(each.image, each.name), made=True)
+        if each.mask is None and (each.image.mode != "RGBA" or _opacity(each.image.getchannel("A")) is None)
+        else each
+        for each in read
+    ]
+
+
+def prepared_photographs(
+    files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
+) -> list[Image.Image]:
+    """Image files as `prepare` has them; see `read_photographs`."""
+    return [each.prepared(crop) for each in read_photographs(files, masks, remove_background, crop)]
 
 
 def on_white(image: Image.Image) -> NDArray[np.uint8]:

@@ -301,7 +301,10 @@ def _losses(folder: Path) -> dict[str, Any]:
 
 
 def _estimate(folder: Path) -> RunPart:
-    sections = [("Cameras", "cameras", lambda _: _cameras(folder)), ("Poses", "poses", lambda _: _poses(folder))]
+    sections: Sections = [
+        ("Cameras", "cameras", lambda _: _cameras(folder)),
+        ("Poses", "poses", partial(_poses, folder)),
+    ]
     return run_part(folder, RESULT, partial(_about_estimate, folder), sections)
 
 
@@ -326,7 +329,7 @@ def _cameras(folder: Path) -> dict[str, Any]:
     return {"figure": figure, "shown": len(shown), "count": len(rows)}
 
 
-def _poses(folder: Path) -> dict[str, Any]:
+def _poses(folder: Path, result: Record) -> dict[str, Any]:
     rows = read_rows(folder / "poses.csv")
     keys = [*POSE, *(f"relative_{key}" for key in POSE)]
     poses = [[float(row[key]) for key in keys] if row["valid"] == "True" else None for row in rows]
@@ -334,7 +337,17 @@ def _poses(folder: Path) -> dict[str, Any]:
     names = [Path(row["file"]).name for row in rows]
     energies = [row["energy"] for row in rows]
     notes = [[row.get(key, "") for key in NOTES] for row in rows] if any(row.get("verdict") for row in rows) else None
-    return {"rows": list(zip(names, images, poses, energies, strict=True)), "notes": notes}
+    masks = [tried(partial(_mask, folder, row), None) for row in rows] if result.get("masks_by") else None
+    return {
+        "rows": list(zip(names, images, poses, energies, strict=True)),
+        **{"notes": notes, "masks": masks, "masks_by": result.get("masks_by")},
+    }
+
+
+def _mask(folder: Path, row: Mapping[str, str]) -> NDArray:
+    """The mask `[H, W, 3]` that the run made for a row's image."""
+    with Image.open(folder / "masks" / Path(row["image"]).name) as mask:
+        return np.asarray(mask.convert("RGB"))
 
 
 def _image(folder: Path, row: Mapping[str, str]) -> NDArray:
