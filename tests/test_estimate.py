@@ -6,6 +6,7 @@ import csv
 import inspect
 import json
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,11 +24,14 @@ from toy_views import toy_view
 
 import lp_framework
 from lp_framework import registry
+from lp_framework.analysis.confidence import Answer, answers
 from lp_framework.commands.building import Components, plain
 from lp_framework.commands.estimate import warn_of_prior
+from lp_framework.data.masks import mask_maker
 from lp_framework.data.photographs import on_white, prepare
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world
+from lp_framework.models.pose_model import PoseModel
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver
 
 SOLVER = '''
@@ -392,3 +396,126 @@ def test_a_prior_may_still_choose_among_the_modes(lp, tmp_path: Path):
     assert finished.status == 0, finished.err
     assert "prior=tiny as it ships knows the twelve embedded objects" in finished.err
     assert all(row[key] == "" for row in rows(tmp_path / "run") for key in CONFIDENCE)
+
+
+def test_masks_are_made_written_and_shown(lp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "rembg", None)  # as if not installed
+    mask_maker.cache_clear()
+    noise = np.random.default_rng(0).integers((60, 150, 60), (90, 180, 90), (256, 256, 3), dtype=np.uint8)
+    for name, place in (("a", (10, 20)), ("b", (20, 80))):
+        view = toy_view("soup_can", *place)
+        photograph = Image.fromarray(np.pad(noise, ((30, 30), (30, 30), (0, 0)), mode="symmetric"))
+        photograph.paste(view, (30, 30), mask=view)
+        photograph.save(tmp_path / f"{name}.png")
+    plain = lp("estimate", "images=[a.png,b.png]", "hydra.run.dir=plain")
+    assert "a.png: has no transparent background (alpha channel) and no mask" in plain.error
+    assert "remove_background=true" in plain.error
+    finished = lp("estimate", "images=[a.png,b.png]", "remove_background=true", "hydra.run.dir=run")
+    assert finished.status == 0, finished.err
+    assert finished.err.count("a rough mask was made by GrabCut") == 1
+    for index, place in enumerate(((10, 20), (20, 80))):
+        truth = np.asarray(toy_view("soup_can", *place).getchannel("A")) >= 128
+        with Image.open(tmp_path / f"run/masks/{index:03d}.png") as file:
+            mask = np.asarray(file)[30:-30, 30:-30] >= 128
+        assert (mask & truth).sum() > 0.9 * (mask | truth).sum()
+    page = (tmp_path / "run/report.html").read_text()
+    assert 'alt="mask of a.png"' in page and "The masks are rough ones by GrabCut" in page
+    assert abs(float(rows(tmp_path / "run")[1]["relative_longitude_degrees"]) - 60) < 20
+    assert json.loads((tmp_path / "run/results.json").read_text())["masks_by"] == "GrabCut"
+
+
+# ---------------------------------------------------------------- bad input
+
+
+@pytest.fixture(scope="module")
+def general() -> PoseModel:
+    return lp_framework.load_model("general")
+
+
+def confidence(general: PoseModel, reference: Image.Image, query: Image.Image) -> tuple[float, Answer]:
+    """The answer's longitude in degrees, and all that is told; every number is finite."""
+    solution = lp_framework.estimate_pose(reference, query, model=general)
+    assert solution.poses.isfinite().all() and solution.energies.isfinite().all() and solution.valid.all()
+    (answer,) = answers(solution)
+    return math.degrees(answer.longitude), answer
+
+
+def textured(seed: int, round_: bool) -> Image.Image:
+    """A disc or a square of random colours."""
+    colours = np.random.default_rng(seed).integers(0, 255, (16, 16, 3), dtype=np.uint8)
+    image = Image.fromarray(colours).resize((200, 200), Image.Resampling.BICUBIC).convert("RGBA")
+    y, x = np.mgrid[-1:1:200j, -1:1:200j]
+    image.putalpha(
+        Image.fromarray(np.uint8(255 * (np.hypot(x, y) < 0.98)) if round_ else np.full((200, 200), 255, "u1"))
+    )
+    frame = Image.new("RGBA", (240, 240))
+    frame.paste(image, (20, 20))
+    return frame
+
+
+def recoloured(view: Image.Image, change: Callable[[np.ndarray], np.ndarray]) -> Image.Image:
+    """A view with the colours `[H, W, 3]` (floats) that a function makes of its own."""
+    pixels = np.array(view)
+    pixels[..., :3] = change(pixels[..., :3].astype(float)).round()
+    return Image.fromarray(pixels)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_random_textures_are_not_trusted(general: PoseModel, seed: int):
+    for query in (textured(seed + 1, True), textured(seed + 1, False)):
+        assert confidence(general, textured(seed, True), query)[1].verdict == "do not trust"
+
+
+@pytest.mark.parametrize(
+    ("reference", "query"),
+    [
+        ("duck", "robot"),
+        ("duck", "soup_can"),
+        ("robot", "soup_can"),
+        ("cottage", "watering_can"),
+        ("sailboat", "soup_can"),
+    ],
+)
+def test_different_objects_are_not_trusted(general: PoseModel, reference: str, query: str):
+    answer = confidence(general, toy_view(reference, 10, 20), toy_view(query, 10, 60))[1]
+    assert answer.verdict in ("doubtful", "do not trust")
+
+
+def test_objects_of_one_colour_are_not_trusted(general: PoseModel):
+    for name in ("soup_can", "duck"):
+        views = [toy_view(name, 10, longitude) for longitude in (20, 80)]
+        plain = [recoloured(view, lambda colours: 0 * colours + [200, 160, 60]) for view in views]
+        assert confidence(general, *plain)[1].probability < 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "known"),
+    [
+        (lambda colours: np.repeat(colours.mean(axis=-1, keepdims=True), 3, axis=-1), True),
+        (lambda colours: 0.06 * colours, True),
+        (lambda colours: 0 * colours, False),
+    ],
+    ids=["grey", "very dark", "black"],
+)
+def test_grey_and_dark_pictures_have_finite_answers(general: PoseModel, change, known: bool):
+    views = [recoloured(toy_view("soup_can", *place), change) for place in ((10, 20), (20, 80))]
+    longitude, answer = confidence(general, *views)
+    assert answer.probability < 0.5 if not known else longitude == pytest.approx(60, abs=15)
+
+
+def test_half_a_mask_is_taken_for_what_it_is(general: PoseModel):
+    views = [toy_view("soup_can", *place) for place in ((10, 20), (20, 80))]
+    pixels = np.array(views[0])
+    pixels[:, 128:, 3] = 0
+    whole, half = confidence(general, *views)[1], confidence(general, Image.fromarray(pixels), views[1])[1]
+    assert half.probability < whole.probability
+
+
+def test_an_object_cut_by_the_border_is_named(lp, tmp_path: Path):
+    files = saved_views(tmp_path, whole=("soup_can", 10, 20), cut=("soup_can", 20, 80))
+    with Image.open(tmp_path / "cut.png") as view:
+        view.crop((0, 0, 256, 160)).save(tmp_path / "cut.png")
+    finished = lp("estimate", f"images=[{','.join(files)}]", "hydra.run.dir=run")
+    assert finished.status == 0, finished.err
+    assert "cut.png: the image's border seems to cut the object off" in finished.err
+    assert "whole.png: the image's border" not in finished.err
