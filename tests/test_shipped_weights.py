@@ -22,6 +22,8 @@ from lp_framework.geometry import relative_pose
 from lp_framework.models.checkpoints import SHIPPED
 from lp_framework.solvers.base import Pairs
 
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 # The test views of every object are those of any other protocol; of training views there are four.
 FEW_VIEWS = ("data.latitude_step_degrees=60", "data.longitude_step_degrees=180")
 
@@ -114,14 +116,22 @@ def test_the_score_model_finds_the_pose(landscape, folder):
     assert turn.abs().max() < math.radians(30)
 
 
-def test_the_readmes_example_finds_the_pose(landscape, folder, monkeypatch, capsys):
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", readme, re.DOTALL) if "estimate_pose" in block]
-    monkeypatch.chdir(folder)
+def test_the_readmes_example_finds_the_pose(monkeypatch, capsys):
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "estimate_pose" in block]
+    monkeypatch.chdir(ROOT)
     exec(compile(code, "README.md", "exec"), {})
-    latitude, longitude, radius = (float(part.rstrip("°")) for part in capsys.readouterr().out.split(", "))
-    poses = read_views(folder / "datasets" / "toy", "duck", "test").poses
-    truth = relative_pose(poses[0], poses[4])
-    assert latitude == pytest.approx(math.degrees(truth[0]), abs=6)
-    assert longitude == pytest.approx(math.degrees(truth[1]), abs=6)
-    assert radius == pytest.approx(truth[2].item(), abs=0.1)
+    latitude, longitude, probability = (float(part.rstrip("°")) for part in capsys.readouterr().out.split(", "))
+    assert latitude == pytest.approx(10, abs=6) and longitude == pytest.approx(60, abs=6)  # as the README says
+    assert probability > 0.9
+
+
+def test_the_readme_shows_what_the_quickstart_estimates(lp):
+    quickstart = (ROOT / "scripts" / "quickstart.sh").read_text()
+    (images,) = re.findall(r'estimate "images=\[(.*?)\]"', quickstart)
+    files = ",".join(str(ROOT / file) for file in images.split(","))
+    out = lp("estimate", f"images=[{files}]", "hydra.run.dir=run").out
+    shown = [
+        line for line in README.splitlines() if line.startswith(("model: general", "example_0.png to", "the crop to"))
+    ]
+    assert len(shown) == 3 and all(line in out for line in shown)
+    assert all(Path(file).stat().st_size < 50_000 for file in files.split(","))
