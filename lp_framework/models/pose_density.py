@@ -88,13 +88,14 @@ class PoseDensity:
     def probability(self, pose: Tensor, degrees: float) -> Tensor:
         """That the true rotation lies within so many degrees of those of relative poses `[..., 3]`, `[...]`.
 
-        It errs to the safe side. The angle between upright cameras, and that between viewing directions, depends on
-        the reference's latitude, which is not known; sqrt(dlatitude^2 + dlongitude^2) is never less than either.
+        The angle between two upright cameras does not depend on the reference's latitude, which is not known: the
+        cosine of its half is that of half the difference in latitude times that of half the difference in longitude.
+        That between their viewing directions is no larger.
         """
-        reach = math.radians(degrees)
+        reach = math.cos(math.radians(degrees) / 2)
         grid = torch.arange(GRID, device=pose.device) * (2 * math.pi / GRID)
         away = wrap_angle(grid - pose[..., 1:2])
-        half = (reach**2 - away.square()).clamp(min=0).sqrt()  # of latitude, at each longitude of the grid
+        half = 2 * (reach / (away / 2).cos().clamp(min=1e-6)).clamp(max=1).acos()  # of latitude, at these longitudes
         off, spread = pose[..., :1] - self.mean[..., :1], math.sqrt(2) * self.deviation[..., :1]
         band = (((off + half) / spread).erf() - ((off - half) / spread).erf()) / 2
         return (self.probabilities * band).sum(dim=-1)
