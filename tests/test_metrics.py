@@ -131,7 +131,7 @@ def fed(given: tuple[torch.Tensor, ...], batch: int = 7) -> PoseMetrics:
 
 
 def expected(given: tuple[torch.Tensor, ...]) -> dict[str, Any]:
-    pair, objects, rotation, translation, chosen, _ = (each.numpy() for each in given)
+    pair, objects, rotation, translation, chosen, *_ = (each.numpy() for each in given)
 
     def over(members: list[int]) -> dict[str, float] | None:
         mask = np.isin(objects, members)
