@@ -18,7 +18,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lp_framework.evaluation.metrics import PoseMetrics, SolvedBatch, summarise
+from lp_framework.evaluation.metrics import STATES, PoseMetrics, SolvedBatch, summarise
 from lp_framework.evaluation.tables import summary_rows, write_json
 from lp_framework.models.pair_mean import PairMean, first_of_each
 
@@ -187,7 +187,7 @@ def test_rows_are_sorted_whole_and_up_to_date():
     metrics = fed(given)
     order = (given[0] @ torch.tensor([32, 1])).argsort()
     metrics.compute()
-    for state, value in zip(("pair", "object", "rotation", "translation", "chosen", "answer"), given, strict=True):
+    for state, value in zip(STATES, given, strict=True):
         torch.testing.assert_close(metrics.rows()[state], value[order], rtol=0, atol=0, equal_nan=True)
     more = rows(pairs=4)
     metrics.update(solved((more[0] + 5_000, *more[1:])))
