@@ -391,7 +391,7 @@ def test_what_looks_alike_from_behind_has_a_second_answer(lp, tmp_path: Path):
 
 def test_a_prior_may_still_choose_among_the_modes(lp, tmp_path: Path):
     files = saved_views(tmp_path, a=("soup_can", 10, 20), b=("soup_can", 20, 80))
-    settings = ("solver=two_stage", "solver.iterations=0", "solver.refinement_steps=2", "hydra.run.dir=run")
+    settings = ("solver=two_stage", "solver.refinement_steps=2", "hydra.run.dir=run")
     finished = lp("estimate", f"images=[{','.join(files)}]", *settings)
     assert finished.status == 0, finished.err
     assert "prior=tiny as it ships knows the twelve embedded objects" in finished.err

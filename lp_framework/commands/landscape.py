@@ -61,6 +61,7 @@ def run(config: DictConfig) -> None:
         solver, prior = components["solver"], components["prior"].to(device)
         move(solver, device)
         model = None if pair.truth is None else components["model"].to(device)
+        move(components["start"], device)
         starts = components["start"].make(pairs, config.seed)
         with shown_progress():
             pair, views, field = explained_pair(pairs, pair, solver, prior, model, starts, draws, grid)

@@ -42,8 +42,8 @@ class Evaluation(LightningModule):
     ) -> None:
         super().__init__()
         self.solver, self.starts, self.seed, self.journal, self.views = solver, starts, seed, journal, views
-        # Registered, so that Lightning moves the networks of the solver to the device.
-        self.networks = torch.nn.ModuleList(solver.networks())
+        # Registered, so that Lightning moves the networks of both to the device.
+        self.networks = torch.nn.ModuleList([*solver.networks(), *starts.networks()])
 
     def setup(self, stage: str) -> None:
         """The objects are known once the data are prepared."""

@@ -30,6 +30,8 @@ from lp_framework.solvers.base import (
 from lp_framework.solvers.joint_density import joint_density
 from lp_framework.solvers.progress import steps_of
 
+SHARP = 0.15  # radians, scene units: smoothing at which the modes of a density stay apart
+
 
 @register("solver", "langevin")
 class Langevin(Solver):
@@ -147,6 +149,13 @@ class Langevin(Solver):
         slope = (ahead - behind) / (2 * step[1])
         beyond = torch.where(slope > 0, variance**2 * slope + variance, 0.0)
         return (variance**2 * score.square().sum(dim=-1) + beyond).sqrt()
+
+
+def before_second_stage(
+    model: PoseModel, alpha: float, gamma: float | Sequence[float], iterations: int, trajectory: bool = False
+) -> Langevin:
+    """`Langevin`, of a model with densities at little smoothing, lest its modes become one."""
+    return Langevin(model, alpha, gamma, iterations, sigma=SHARP if model.has_density else None, trajectory=trajectory)
 
 
 def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:

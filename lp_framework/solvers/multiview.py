@@ -17,12 +17,11 @@ from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, check_starts, choose
-from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.langevin import before_second_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
 from lp_framework.solvers.twist import DescentSettings, TanhRadius, TwistPoses
 
-SHARP = 0.15  # radians, scene units: smoothing at which the modes of a density stay apart
 NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model does not tell it
 
 
@@ -69,7 +68,7 @@ class MultiView(Solver):
         check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 1, "at least 1"))
         self.model, self.prior = model, prior
         self.first_stage, self.second_stage = first_stage, second_stage
-        self.first = Langevin(model, alpha, gamma, iterations, sigma=SHARP if model.has_density else None)
+        self.first = before_second_stage(model, alpha, gamma, iterations)
         self.second = DescentSettings(
             refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, "rescored", rescoring
         )

@@ -16,7 +16,7 @@ from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
-from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.langevin import before_second_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
 from lp_framework.solvers.twist import ChooseBy, DescentSettings, TanhRadius, TwistDescent
@@ -51,7 +51,7 @@ class TwoStage(Solver):
     ) -> None:
         check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"))
         self.model, self.prior = model, prior
-        self.first = Langevin(model, alpha, gamma, iterations, trajectory=trajectory)
+        self.first = before_second_stage(model, alpha, gamma, iterations, trajectory)
         settings = DescentSettings(
             refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, choose_by, rescoring
         )
@@ -132,7 +132,7 @@ class GaussNewton(Solver):
             ("timesteps", list(timesteps), known, f"one or more of 0 to {prior.num_timesteps - 1}"),
             ("damping", damping, 0 < damping < math.inf, "positive"),
         )
-        self.first = Langevin(model, alpha, gamma, iterations, trajectory=trajectory)
+        self.first = before_second_stage(model, alpha, gamma, iterations, trajectory)
         self.model, self.prior = model, prior
         self.steps, self.timesteps, self.damping = refinement_steps, list(timesteps), damping
         self.trajectory = trajectory
