@@ -271,6 +271,22 @@ class Moving(torch.nn.Module):
         return "moving"
 
 
+def test_test_views_can_be_cropped_as_photographs_are_and_others_are_not(make, root):
+    for file in root.glob("*/*/rgb/*.png"):
+        pixels = np.zeros((64, 64, 4), dtype=np.uint8)
+        pixels[40:50, 5:25] = [200, 0, 0, 255]
+        Image.fromarray(pixels).save(file)
+    for crop in (False, True):
+        module = make(crop=crop, image_size=256)
+        for split in ("test", "train"):
+            shown = (np.asarray(module.data(split).images[0])[..., 1] < 128).nonzero()
+            height, width = (np.ptp(each) + 1 for each in shown)
+            cropped = crop and split == "test"
+            assert width == pytest.approx(200 if cropped else 80, abs=2)
+            assert height == pytest.approx(width / 2, abs=2)
+            assert shown[0].mean() == pytest.approx(127.5 if cropped else 180, abs=2)
+
+
 def test_what_was_moved_to_compute_features_can_still_be_trained(make):
     backbone, data = Moving(), make()
     data.cache_features(backbone)

@@ -21,7 +21,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
-from lp_framework.data.photographs import on_white, opened
+from lp_framework.data.photographs import on_white, opened, prepare
 from lp_framework.data.views import DEPTH_UNIT
 from lp_framework.errors import UserError
 
@@ -99,13 +99,17 @@ def content_key(files: Iterable[Path], *facts: object) -> str:
     return digest.hexdigest()
 
 
-def decoded_views(files: Sequence[Path], size: int, folder: str | Path) -> tuple[str, NDArray]:
-    """Key and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized; decoded once.
+def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bool = False) -> tuple[str, NDArray]:
+    """Key and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized; decoded once. With
+    `crop` the object is centred and scaled as that of a photograph, by the alpha channel (see `prepare`).
+
     `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
-    key = content_key(files, "views", size)
-    return key, cached_array(
-        folder, key, len(files), lambda: _decoded(files, lambda image: pixels_on_white(image, size), "decoding views")
-    )
+
+    def decode(image: Image.Image) -> NDArray:
+        return pixels_on_white(prepare(image.convert("RGBA"), "data.crop=true") if crop else image, size)
+
+    key = content_key(files, "crops" if crop else "views", size)
+    return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))
 
 
 def pixels_on_white(image: Image.Image, size: int) -> NDArray[np.uint8]:

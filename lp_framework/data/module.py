@@ -44,7 +44,8 @@ class PairDataModule(LightningDataModule):
     `cache` holds the decoded views (square, `image_size` pixels a side). A training batch has about `batch_pairs` pairs
     over blocks of `block` views (see `BlockSampler`). `validation_views` of each object's training views are held out
     to choose the best checkpoint; or, with `validation_objects`, so many objects, of which so many views are used then.
-    The test views are not touched before evaluation.
+    The test views are not touched before evaluation; with `crop` they are prepared as photographs are, which loses the
+    radius.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class PairDataModule(LightningDataModule):
         validation_views: int = 8,
         validation_objects: int = 0,
         photographs: float = 0.0,
+        crop: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -74,7 +76,7 @@ class PairDataModule(LightningDataModule):
         )  # fmt: skip
         self.source, self.cache = source, Path(cache)
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
-        self.photographs = photographs
+        self.photographs, self.crop = photographs, crop
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
         self._extractor: FeatureExtractor | None = None
         self._carried: set[str] = set()
@@ -182,7 +184,8 @@ class PairDataModule(LightningDataModule):
             images = views["pixels"]
             arrays = {"points": views["points"], "cropped": views["cropped"]}
         else:
-            key, images = decoded_views(files, self.image_size, self.cache)
+            crop = self.crop and split in ("test", "all_train")
+            key, images = decoded_views(files, self.image_size, self.cache, crop)
             arrays = {}
         arrays["images"] = images
         self._image_keys[_folder(split)] = key
