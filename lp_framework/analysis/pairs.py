@@ -251,6 +251,7 @@ def with_fields(
     if first_stage is not None:
         guided = copy.copy(first_stage)
         guided.model = exact  # type: ignore[assignment]  # has all of a PoseModel that this solver asks for
+        guided.sigmas = None  # the exact field is that at the model's sigma
         ideal = solved_pairs(pairs, shown, guided, starts, seed)
     name, radius = "exp(-E) and score" if model.has_energy else "score", truths(shown)[:, 2]
     maps = []

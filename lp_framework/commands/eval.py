@@ -27,7 +27,7 @@ from lp_framework.models.checkpoints import find_checkpoint
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Solver
 from lp_framework.solvers.starts import Starts
-from lp_framework.viz.curves import errors_figure
+from lp_framework.viz.curves import calibration_figure, errors_figure
 from lp_framework.viz.maps import pair_figure
 from lp_framework.viz.sheets import ObjectCard, objects_figure
 from lp_framework.viz.style import save_figure
@@ -196,4 +196,6 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: 
             rates = metrics["R(R)@15"], metrics.get("SR(R)@30")
             cards.append(ObjectCard(name, data.table.ambiguities[index], view, *rates))
     figures["objects"] = objects_figure(cards)
+    if calibration := result["breakdown"].get("calibration"):
+        figures["calibration"] = calibration_figure(calibration["bins"], f"{rows['object'].unique().numel()} objects")
     return [save_figure(figure, folder / name)[0] for name, figure in figures.items()]

@@ -86,6 +86,25 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
     return figure
 
 
+@styled
+def calibration_figure(bins: Sequence[Mapping[str, float]], title: str) -> Figure:
+    """Share of right answers against their probability, of `evaluation.breakdown`'s bins; areas tell their pairs."""
+    figure = Figure(figsize=(4.4, 4.4), layout="constrained")
+    axes = figure.subplots()
+    probability, right, pairs = (np.array([each[key] for each in bins]) for key in ("probability", "right", "pairs"))
+    axes.plot([0, 1], [0, 1], color=MUTED, label="calibrated", **DASHED)
+    axes.plot(probability, right, color=style.BLUE, zorder=3)
+    axes.scatter(probability, right, 20 + 600 * pairs / pairs.sum(), color=style.BLUE, alpha=0.6, zorder=4, linewidth=0)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02), aspect="equal", xlabel="probability that the model tells")
+    axes.set_ylabel("share within 30°")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(PercentFormatter(1.0))
+    axes.set_title(title, loc="left")
+    axes.legend(loc="upper left", frameon=False)
+    open_frame(axes)
+    return figure
+
+
 class Curve(NamedTuple):
     """A logged value: `step` `[S]` and `value` `[S]`."""
 
