@@ -106,7 +106,9 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
     `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
 
     def decode(image: Image.Image) -> NDArray:
-        return pixels_on_white(prepare(image.convert("RGBA"), "data.crop=true") if crop else image, size)
+        return pixels_on_white(
+            prepare(image.convert("RGBA"), str(getattr(image, "filename", "a view"))) if crop else image, size
+        )
 
     key = content_key(files, "crops" if crop else "views", size)
     return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))

@@ -89,6 +89,7 @@ class Evaluation(LightningModule):
             valid=solution.valid[:, None].expand_as(ids).reshape(-1, 1),
             chosen=torch.zeros_like(pairs.reference),
             cost=solution.cost,
+            probability=None if solution.pairs is None else _of_chosen(solution.pairs)[:, None],
         )
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:

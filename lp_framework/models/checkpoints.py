@@ -29,7 +29,7 @@ from lp_framework.models.trained_module import RECIPE, TrainedModule
 FOLDER = "checkpoints"
 LATEST = "latest"
 LAST, BEST = "last.ckpt", "best.ckpt"
-TRAINED_ON = {"general": "1,840 procedural objects"}
+TRAINED_ON = {"general": "3,940 procedural objects"}
 SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
 CONFIG, WEIGHTS = "model.json", "model.safetensors"
 ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
