@@ -25,6 +25,7 @@ from lp_framework.analysis.pairs import PoseMap, ShownPair, View, in_one_scale
 from lp_framework.commands.eval import save_pictures
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews
+from lp_framework.evaluation.breakdown import breakdown
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.metrics import summarise
 from lp_framework.geometry import camera_to_world, wrap_angle
@@ -453,7 +454,8 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
 
 def test_pictures_of_an_evaluation(data: PairData, tmp_path: Path):
     evaluation = evaluated(Langevin(ScoreModel(Means(), hidden=8, layers=1), iterations=5), data, Ring(4))
-    files = save_pictures(tmp_path / "pictures", evaluation, data, evaluation.metrics.compute())
+    result = {**evaluation.metrics.compute(), "breakdown": breakdown(evaluation.metrics.rows(), evaluation.table)}
+    files = save_pictures(tmp_path / "pictures", evaluation, data, result)
     names = [file.stem for file in files]
     assert names == [*(f"field_{number}" for number in range(len(names) - 2)), "errors", "objects"]
     assert 3 <= len(names) - 2 <= 4
@@ -464,6 +466,14 @@ def test_pictures_of_an_evaluation(data: PairData, tmp_path: Path):
     assert {file.suffix for file in (tmp_path / "pictures").iterdir() if file.is_file()} == {".png", ".pdf"}
     kept = read_examples(tmp_path / "pictures" / EXAMPLES)
     assert len(kept) == len(names) - 2 and all(each.trajectories is not None for each in kept)
+
+
+def test_the_calibration_of_an_evaluation_that_tells_probabilities(data: PairData, tmp_path: Path):
+    evaluation = evaluated(Langevin(ScoreModel(Means(), hidden=8, layers=1), iterations=5), data, Ring(4))
+    bins = [{"pairs": 3, "probability": 0.2, "right": 0.3}, {"pairs": 9, "probability": 0.9, "right": 0.8}]
+    result = {**evaluation.metrics.compute(), "breakdown": {"calibration": {"bins": bins}}}
+    files = save_pictures(tmp_path / "pictures", evaluation, data, result)
+    assert files[-1].stem == "calibration" and imread(files[-1])[..., :3].std() > 0.02
 
 
 def test_solver_without_model_has_one_map_without_arrows(data: PairData):
