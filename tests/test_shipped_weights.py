@@ -39,7 +39,7 @@ def landscape(folder) -> dict[str, Any]:
     here, argv = Path.cwd(), sys.argv
     os.chdir(folder)
     try:
-        sys.argv = ["lp", "landscape", *FEW_VIEWS, "noises=1", "hydra.run.dir=landscape"]
+        sys.argv = ["lp", "landscape", *FEW_VIEWS, "noises=1", "timesteps=[300,700]", "hydra.run.dir=landscape"]
         assert cli.main() == 0
     finally:
         os.chdir(here)
