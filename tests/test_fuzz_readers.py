@@ -36,7 +36,6 @@ from lp_framework.data.sets.rendered import read_labels
 from lp_framework.data.views import read_views
 from lp_framework.evaluation.journal import Journal
 from lp_framework.evaluation.metrics import SolvedBatch
-from lp_framework.report.idpose_results import read_idpose_results
 from lp_framework.report.runs import find_runs
 
 FUZZ = settings(
@@ -221,23 +220,6 @@ def test_meshes(tmp_path_factory, data):
 
 
 # ---------------------------------------------------------------- results
-
-
-RESULT = {
-    "anchor_vid": "011",
-    "obs": {"011": {"rel_sph": [0, 0, 0]}, "001": {"rel_sph": [0.1, 2.0, 0.0]}, "077": {"rel_sph": [0.3, 4.0, 0.1]}},
-}
-
-
-@FUZZ
-@given(content=json_damage(RESULT))
-def test_results_of_id_pose(tmp_path, content):
-    file = tmp_path / "dinosaur_002_011+001+077.json"
-    file.write_bytes(content)
-    found = read_or_told(lambda: read_idpose_results(tmp_path, ["dinosaur_002"]), file)
-    if found is not None:
-        assert found and all(pair.pose.shape == (3,) for pair in found)
-        assert all(pair.object == "dinosaur_002" and pair.query != "011" for pair in found)
 
 
 @pytest.fixture(scope="module")

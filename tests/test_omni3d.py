@@ -14,9 +14,14 @@ from lp_framework.data.module import PairDataModule
 from lp_framework.data.sets.omni3d import Omni3DData, omni3d_cameras
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
-from lp_framework.geometry import camera_to_world, relative_pose, view_pose
-from lp_framework.report import idpose_results
-from lp_framework.report.idpose_results import evaluate_idpose, read_idpose_results
+from lp_framework.geometry import (
+    apply_relative_pose,
+    camera_to_world,
+    relative_pose,
+    rotation_error,
+    translation_error,
+    view_pose,
+)
 
 PUBLISHED = Path(__file__).parent / "data" / "idpose.json"  # cameras and results of ID-Pose's published example
 POSES = {"011": (0.25, 1.0, 4.0), "001": (0.1, 3.0, 4.0), "077": (-0.2, 5.5, 4.2)}
@@ -184,73 +189,7 @@ def test_wrong_roots(root, tmp_path):
         Omni3DData(root / "dinosaur_002").names()
 
 
-# ---------------------------------------------------------------- ID-Pose's results
-
-
-def write_results(folder: Path, off: tuple[float, float, float]) -> Path:
-    """A result of ID-Pose that is `off` (polar angle, azimuth, radius as the file has them) for every view."""
-    anchor, *others = POSES
-    obs: dict[str, dict] = {anchor: {"elev": 1.2}}
-    for view in others:
-        latitude, longitude, radius = (b - a for a, b in zip(POSES[anchor], POSES[view], strict=True))
-        truth = (-latitude, longitude % (2 * math.pi), radius * 1.85 / POSES[anchor][2])
-        obs[view] = {"rel_sph": [a + b for a, b in zip(truth, off, strict=True)]}
-    path = folder / f"dinosaur_002_{'+'.join(POSES)}" / "pose.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({"anchor_vid": anchor, "obs": obs}))
-    return path
-
-
-def test_true_poses_have_no_error(root, tmp_path):
-    write_results(tmp_path / "outputs", (0.0, 0.0, 0.0))
-    result = evaluate_idpose(tmp_path / "outputs", root)
-    assert result["pairs"] == 2 and result["metrics"]["R@5"] == 1
-    assert result["metrics"]["rotation_error"] < 1e-4 and result["metrics"]["translation_error"] < 1e-5
-
-
-@pytest.mark.parametrize("off", [(math.radians(3), 0.0, 0.0), (0.0, 0.0, 0.5)])
-def test_errors_are_in_degrees_and_in_units_where_the_reference_stands_at_185(root, tmp_path, off):
-    write_results(tmp_path / "outputs", off)
-    metrics = evaluate_idpose(tmp_path / "outputs", root)["metrics"]
-    assert metrics["rotation_error"] == pytest.approx(math.degrees(off[0]), abs=1e-4)
-    if off[2]:
-        assert metrics["translation_error"] == pytest.approx(off[2], abs=1e-5)
-    else:
-        chord = 2 * math.sin(off[0] / 2)  # of unit radius; the queries stand at 1.85 and 1.85 * 4.2 / 4
-        assert metrics["translation_error"] == pytest.approx(chord * 1.85 * (1 + 1.05) / 2, abs=1e-5)
-
-
-def test_results_are_relative_poses(root, tmp_path):
-    write_results(tmp_path / "outputs", (0.0, 0.0, 0.0))
-    found = read_idpose_results(tmp_path / "outputs", Omni3DData(root).names())
-    assert [pair[:3] for pair in found] == [("dinosaur_002", "011", "001"), ("dinosaur_002", "011", "077")]
-    cameras = omni3d_cameras(root, "dinosaur_002")
-    poses = {view: view_pose(camera) for view, camera in cameras.items()}
-    for pair in found:
-        expected = relative_pose(poses["011"], poses[pair.query])
-        torch.testing.assert_close(pair.pose, expected, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "needs anchor_vid"),
-        ("[]", "needs anchor_vid"),
-        ('{"anchor_vid": "011", "obs": {"001": {}}}', r"needs anchor_vid.*rel_sph"),
-        ('{"anchor_vid": "011", "obs": {"001": {"rel_sph": [1, 2]}}}', "three numbers"),
-        ('{"anchor_vid": "012", "obs": {"001": {"rel_sph": [1, 2, 3]}}}', "its name tells none of the objects"),
-        ('{"anchor_vid": "011", "obs": {"002": {"rel_sph": [1, 2, 3]}}}', r"poses/002\.npy is missing"),
-    ],
-)
-def test_malformed_results(root, tmp_path, content, message):
-    write_results(tmp_path / "outputs", (0.0, 0.0, 0.0)).write_text(content)
-    with pytest.raises(UserError, match=message):
-        evaluate_idpose(tmp_path / "outputs", root)
-
-
-def test_a_folder_without_results(root, tmp_path, capsys):
-    assert idpose_results.main([str(tmp_path), str(root)]) == 2
-    assert "holds no results of ID-Pose" in capsys.readouterr().err
+# ---------------------------------------------------------------- ID-Pose's published example
 
 
 @pytest.fixture
@@ -265,27 +204,34 @@ def published(tmp_path) -> Path:
     return root
 
 
-def test_the_published_results_with_zero123_xl(published, capsys):
-    result = evaluate_idpose(published, published)
-    assert result["pairs"] == 9 and sorted(result["per_object"]) == ["dinosaur_002", "house_001", "ornaments_001"]
-    metrics = result["metrics"]
-    assert [metrics[key] * 9 for key in ("R@5", "R@15", "R@30")] == pytest.approx([3, 4, 4])
-    assert [metrics[key] * 9 for key in ("R(R)@5", "R(R)@15", "R(R)@30")] == pytest.approx([3, 8, 8])
-    assert metrics["rotation_error"] == pytest.approx(5.903, abs=1e-3)
-    assert metrics["translation_error"] == pytest.approx(0.2071, abs=1e-4)
-    # The file has its own account of the truth.
-    found = read_idpose_results(published, Omni3DData(published).names())
-    for file in published.glob("*.json"):
-        for view, entry in json.loads(file.read_text())["obs"].items():
+def test_the_published_results_with_zero123_xl(published):
+    """Our errors of its answers, `rel_sph`, in units where the reference stands at 1.85; and its own truths are ours.
+
+    Its polar angles are counted from the pole, our latitudes from the equator.
+    """
+    rotations, translations = [], []
+    for name, example in json.loads(PUBLISHED.read_text()).items():
+        cameras, content = omni3d_cameras(published, name), example["content"]
+        reference = cameras[content["anchor_vid"]]
+        scale = 1.85 / reference[:3, 3].norm()
+        for view, entry in content["obs"].items():
+            if view == content["anchor_vid"]:
+                continue
+            pair = torch.stack([reference, cameras[view]])
+            pair[:, :3, 3] *= scale
+            poses = view_pose(pair)
+            polar, azimuth, radius = entry["rel_sph"]
+            answer = torch.tensor([-polar, azimuth, radius], dtype=torch.float64)
+            found = camera_to_world(apply_relative_pose(poses[0], answer))
+            rotations.append(rotation_error(found, pair[1]).item())
+            translations.append(translation_error(found, pair[1]).item())
             if "gt_rel_sph" in entry:
-                name = next(name for name in Omni3DData(published).names() if name in file.name)
-                cameras = omni3d_cameras(published, name)
-                (pair,) = [each for each in found if (each.object, each.query) == (name, view)]
-                truth = relative_pose(view_pose(cameras[pair.reference]), view_pose(cameras[view]))
                 polar, azimuth, _ = entry["gt_rel_sph"]
-                assert truth[:2].tolist() == pytest.approx([-polar, azimuth], abs=1e-6)
-    assert idpose_results.main([str(published), str(published)]) == 0
-    assert "ID-Pose, 9 pairs" in capsys.readouterr().out
+                assert relative_pose(*poses)[:2].tolist() == pytest.approx([-polar, azimuth], abs=1e-6)
+    counts = [sum(rotation <= degrees for rotation in rotations) for degrees in (5, 15, 30)]
+    assert (len(rotations), counts) == (9, [3, 8, 8])
+    assert np.median(rotations) == pytest.approx(5.903, abs=1e-3)
+    assert np.median(translations) == pytest.approx(0.2071, abs=1e-4)
 
 
 def test_the_published_views_load(published, tmp_path):

@@ -1,4 +1,4 @@
-"""The harness of `bench`: two contenders at work in turn, and what it takes of operations, launches and memory."""
+"""The harness of `bench`: two contenders at work in turn, and the memory that they take."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import FlopCounterMode
 
 from lp_framework.clock import now
 
@@ -87,28 +86,6 @@ def timed(work: Callable[[], _Result], device: torch.device) -> tuple[float, _Re
     return now(device) - began, result
 
 
-def counted(work: Callable[[], object]) -> int:
-    """Floating-point operations of the matrix products, convolutions and attentions in work on any device, meta too."""
-    with FlopCounterMode(display=False) as counter:
-        work()
-    return int(counter.get_total_flops())
-
-
-def peak_rate(device: torch.device, dtype: torch.dtype) -> float:
-    """Operations a second of the fastest of a few products of square matrices."""
-    side = 8192 if device.type == "cuda" else 1024
-    matrix = torch.randn(side, side, device=device).to(dtype)
-    matrix @ matrix
-    return 2 * side**3 / min(timed(lambda: matrix @ matrix, device)[0] for _ in range(5))
-
-
-def launched(work: Callable[[], object]) -> int:
-    """Operators in a piece of work that compute something, each at least one launch of a kernel on a GPU."""
-    with _Operators() as operators:
-        work()
-    return operators.launches
-
-
 def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
     """Bytes that the tensors made by some work take at most at once, beyond those that were there before.
 
@@ -122,25 +99,22 @@ def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
         work()
         torch.cuda.synchronize(device)
         return torch.cuda.max_memory_allocated(device) - before
-    with _Operators() as operators:
+    with _Storages() as storages:
         work()
-    return operators.peak
+    return storages.peak
 
 
-class _Operators(TorchDispatchMode):
-    """Counts operators, and the bytes of the storages that they make, from their making to their end."""
-
-    FREE = ("aten::_unsafe_view", "aten::empty", "aten::new_empty")  # and what begins so: launches nothing
+class _Storages(TorchDispatchMode):
+    """Counts the bytes of the storages that operators make, from their making to their end."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.launches = self.now = self.peak = 0
+        self.now = self.peak = 0
         self.alive: dict[int, int] = {}
 
     def __torch_dispatch__(
         self, function: Any, types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
-        self.launches += not (function.is_view or function.name().startswith(self.FREE))
         arguments = {*_storages((args, kwargs))}
         result = function(*args, **(kwargs or {}))
         for key, storage in _storages(result).items():

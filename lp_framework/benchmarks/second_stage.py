@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Section, counted, launched, peak_rate, timed, worth
+from lp_framework.benchmarks.harness import Section, timed, worth
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
     Architecture,
@@ -47,14 +46,6 @@ PROBE_NOISES = 2  # a timestep
 PROBE_SEED = 1  # the solvers' is 0
 
 
-class Arithmetic(NamedTuple):
-    """The operations of a start's step, in how many launches, and how many a second the device's peak is."""
-
-    operations: int
-    peak: float
-    launches: int | None = None  # where they were counted
-
-
 def measure_step(section: Section, computing: Computing, starts: Sequence[int], rounds: int, steps: int) -> None:
     """Optimisation steps on random weights; `computing` is how the batch is computed, the loop is as published."""
     device = section.device
@@ -66,10 +57,6 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     ready = encoded(batch_prior, codes)
     ring = {count: Ring(count).make(pair, seed=0) for count in starts}
     loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(starts)][0]]
-    arithmetic = arithmetic_of(computing, device)
-    if not (computing.compile or computing.cuda_graph):  # which are there to spare launches
-        one, two = (launched(batched(ready, pair, ring[min(starts)], number)) for number in (1, 2))
-        arithmetic[BATCHED] = arithmetic[BATCHED]._replace(launches=two - one)
     # A step of some size is prepared when it is first taken; recorded, it takes its memory then.
     peaks = {count: held_bytes(batched(ready, pair, poses, 1), batch_prior, device) for count, poses in ring.items()}
     loop_peak = held_bytes(loops[0].step, loop_prior, device)
@@ -78,12 +65,9 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     section.note = (
         f"Zero123's {computing.architecture} size, random weights. {BATCHED}: all starts and both directions "
         f"together, images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images anew each "
-        "step; " + "; ".join(f"{name}: a start's step is {_in_words(each)}" for name, each in arithmetic.items())
+        "step"
     )
-    section.facts = {
-        "encoding_seconds": encoding,
-        "arithmetic_per_start": {name: each._asdict() for name, each in arithmetic.items()},
-    }
+    section.facts = {"encoding_seconds": encoding}
     works = {
         f"{told(count)}, seconds a step": (
             batched(ready, pair, poses, steps),
@@ -92,9 +76,6 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
         for count, poses in ring.items()
     }
     section.race(works, rounds, warm_up=False)
-    for count, label in zip(starts, works, strict=True):
-        both = zip(arithmetic.values(), section.medians()[label], strict=True)
-        section.add(f"{told(count)}, share of peak", *(count * a.operations / seconds / a.peak for a, seconds in both))
 
 
 def measure_pair(
@@ -129,35 +110,9 @@ def measure_pair(
     section.race(works, rounds, warm_up=False)
 
 
-def _in_words(work: Arithmetic) -> str:
-    launches = f" in {work.launches:,} launches" if work.launches else ""
-    return f"{work.operations / 1e9:.3g} GFLOP{launches}, the device's peak {work.peak / 1e12:.3g} TFLOP/s"
-
-
 def told(starts: int) -> str:
     """The number of starts in words."""
     return f"{starts} start{'s' if starts > 1 else ''}"
-
-
-def arithmetic_of(computing: Computing, device: torch.device) -> dict[str, Arithmetic]:
-    """What the energy of a start and its gradient take of either contender, counted without computing anything."""
-    meta = torch.device("meta")
-    networks, pair = computing.networks(meta), random_pair(meta)
-    prior = Computing(dtype=computing.dtype, attention=computing.attention).prior(networks)
-    energy, loop = PairEnergy(prior, pair, seed=0), PlainLoop(plain_prior(networks), pair.images, torch.zeros(3))
-    poses = torch.zeros(1, 1, 3, device=meta, requires_grad=True)
-    noise = torch.empty(1, 2, *prior.latent_shape, device=meta)
-
-    def ours() -> None:
-        energy(poses, TIMESTEP, noise).sum().backward()
-
-    def plain() -> None:
-        loop.loss(poses[0, 0], noise[0]).backward()
-
-    return {
-        BATCHED: Arithmetic(counted(ours), peak_rate(device, DTYPES[computing.dtype])),
-        LOOP: Arithmetic(counted(plain), peak_rate(device, torch.float32), launched(plain)),
-    }
 
 
 def variant(words: str, architecture: Architecture, max_batch: int | None) -> Computing:
@@ -184,27 +139,20 @@ def measure_precision(
     prior = plain.prior(networks)
     codes = prior.encode(pair.images)
     ready = encoded(prior, codes)
-    operations = starts * arithmetic_of(plain, device)[BATCHED].operations
     memory = held_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
         exact = gradient(ready, pair, poses)
-    section.note = (
-        f"Zero123's {architecture} size, random weights, {starts} starts, a step is {operations / 1e9:.3g} GFLOP"
-    )
+    section.note = f"Zero123's {architecture} size, random weights, {starts} starts"
     for words, computing in computings.items():
         other = computing.prior(networks)
         theirs = encoded(other, codes)
         # The first step: once recorded it takes no more memory.
         its_memory = held_bytes(partial(gradient, theirs, pair, poses), other.unet, device)
         off = ((gradient(theirs, pair, poses) - exact).abs().max() / exact.abs().max()).item()
-        peaks = [peak_rate(device, DTYPES[each.dtype]) for each in (computing, plain)]
-        section.note += f"; {words}: gradient off by {off:.1g}, the device's peak {peaks[0] / 1e12:.3g} TFLOP/s"
-        section.facts[words] = {"gradient_deviation": off, "peak_operations_per_second": peaks[0]}
+        section.note += f"; {words}: gradient off by {off:.1g}"
+        section.facts[words] = {"gradient_deviation": off}
         label = f"{words}: seconds a step"
         section.race({label: (batched(theirs, pair, poses, steps), batched(ready, pair, poses, steps))}, rounds)
-        seconds = section.medians()[label]
-        shares = (operations / each / peak for each, peak in zip(seconds, peaks, strict=True))
-        section.add(f"{words}: share of peak", *shares)
         if device.type == "cuda":
             section.add(f"{words}: peak memory, GB", its_memory / 1e9, memory / 1e9)
         del other, theirs

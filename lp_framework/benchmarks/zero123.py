@@ -1,21 +1,18 @@
-"""Zero123 as `bench` has it: with random weights, at its full or at a narrow size; its contenders; loading it."""
+"""Zero123 as `bench` has it: with random weights, at its full or at a narrow size; and its contenders."""
 
 from __future__ import annotations
 
 import copy
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from lp_framework.benchmarks.harness import Section, Work, peak_bytes, worth
+from lp_framework.benchmarks.harness import Work, peak_bytes, worth
 from lp_framework.priors.base import Prior, ViewCode
-from lp_framework.priors.zero123 import original
 from lp_framework.priors.zero123.networks import (
     DTYPES,
     PUBLISHED,
@@ -28,13 +25,11 @@ from lp_framework.priors.zero123.networks import (
     vae_config,
 )
 from lp_framework.priors.zero123.prior import IMAGE_SIZE, Zero123Prior
-from lp_framework.priors.zero123.weights import load_networks, write_folder
 from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.twist import IFusion, SineRadius, TwistPoses
 
 _Prior = TypeVar("_Prior", bound=Prior)
 TIMESTEP = 500  # the work is that of any other
-LOADING = "checkpoint: loading Zero123", ("converted folder", "original file")
 
 Architecture = Literal["published", "narrow"]
 NARROW: Configs = {  # the same layers, few and narrow: to try the measurement in seconds
@@ -150,55 +145,3 @@ def looped(loops: Sequence[PlainLoop], steps: int) -> None:
     for loop in loops:
         for _ in range(steps):
             loop.step()
-
-
-def measure_loading(
-    section: Section, architecture: Architecture, dtypes: Sequence[Dtype], rounds: int, place: Path
-) -> None:
-    """Loading onto the CPU in each of `dtypes`, in which the folder is kept, too; the original is float32.
-
-    The files, of random weights, lie in a temporary folder in `place`. The original holds the U-Net twice, raw and
-    averaged, as published ones; it lacks their optimizer state, which is not read.
-    """
-    section.note = f"Zero123's {architecture} size, random weights; files just written, so from memory rather than disk"
-    with tempfile.TemporaryDirectory(dir=place) as folder:
-        networks = Computing(architecture).networks(torch.device("cpu"))
-        published = Path(folder) / "original.ckpt"
-        torch.save({"state_dict": original_tensors(networks)}, published)
-        works = {}
-        for dtype in sorted(dtypes, key=lambda dtype: -DTYPES[dtype].itemsize):  # each is converted from the one before
-            converted = Path(folder) / dtype
-            write_folder(networks.to(DTYPES[dtype]), converted)
-            size = sum(file.stat().st_size for file in converted.rglob("*"))
-            section.add(f"{dtype}: GB on disk", size / 1e9, published.stat().st_size / 1e9)
-            first, second = (
-                worth(1, partial(load_networks, str(file), None, "ema", dtype)) for file in (converted, published)
-            )
-            works[f"{dtype}: seconds to load"] = first, second
-        del networks
-        section.race(works, rounds)
-
-
-def original_tensors(networks: Networks) -> dict[str, Tensor]:
-    """The tensors as the training code names and shapes them, the U-Net's also as moving averages; see `original`."""
-    unet = _renamed(networks.unet, original.unet_modules(networks.unet.config))
-    vae = _renamed(networks.vae, original.vae_modules(networks.vae.config))
-    clip = _renamed(networks.image_encoder, original.clip_modules(networks.image_encoder.config.to_dict()))
-    for key in [key for key in vae if ".attn_1." in key and vae[key].ndim == 2]:  # matrices as 1 x 1 convolutions
-        vae[key] = vae[key][:, :, None, None]
-    for key in [key for key in clip if ".q_proj." in key]:  # queries, keys and values as one tensor
-        parts = [clip.pop(key.replace(".q_proj.", f".{letter}_proj.")) for letter in "qkv"]
-        clip[key.replace(".q_proj.", ".in_proj_")] = torch.cat(parts)
-    clip["proj"] = clip.pop("visual_projection.weight").t()
-    return {
-        **{f"{original.UNET}{key}": tensor for key, tensor in unet.items()},
-        **{f"{original.EMA}diffusion_model{key.replace('.', '')}": tensor.clone() for key, tensor in unet.items()},
-        **{f"{original.VAE}{key}": tensor for key, tensor in vae.items()},
-        **{f"{original.VISUAL}{key}": tensor for key, tensor in clip.items()},
-        **{f"{original.PROJECTION}{key}": tensor for key, tensor in networks.cc_projection.state_dict().items()},
-    }
-
-
-def _renamed(network: torch.nn.Module, modules: dict[str, str]) -> dict[str, Tensor]:
-    back = {ours: theirs for theirs, ours in modules.items()}
-    return {original.renamed(name, back): tensor for name, tensor in network.state_dict().items()}

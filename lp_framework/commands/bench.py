@@ -35,7 +35,6 @@ MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]]
     "precision": (second_stage.measure_precision, second_stage.PRECISION),
     "adam_gauss_newton": (second_stage.measure_descent, second_stage.DESCENT),
     "rendering": (rendering.measure, rendering.CONTENDERS),
-    "checkpoint": (zero123.measure_loading, zero123.LOADING),
     "scaling": (stages.measure_scaling, stages.SCALING),
 }
 
@@ -63,7 +62,7 @@ def run(config: DictConfig) -> None:
     try:
         for name in names:
             function, (title, contenders) = MEASUREMENTS[name]
-            wanted = arguments(name, function, settings, device, folder)
+            wanted = arguments(name, function, settings, device)
             section = Section(title, contenders, device, save)
             sections[name] = section
             with Console(stderr=True).status(f"measuring {name}"):
@@ -79,7 +78,7 @@ def run(config: DictConfig) -> None:
 
 
 def arguments(
-    name: str, function: Callable[..., None], settings: Mapping[str, Any], device: torch.device, folder: Path
+    name: str, function: Callable[..., None], settings: Mapping[str, Any], device: torch.device
 ) -> dict[str, Any]:
     """What a measurement takes besides its section: the settings of its name, and objects by theirs."""
     components = Components(settings)  # anew, so that no measurement finds the GPU full of another's networks
@@ -93,7 +92,6 @@ def arguments(
         "renderers": lambda: {
             each: registry.build("renderer", each) for each in registry.names("renderer") if each != "auto"
         },
-        "place": lambda: folder,
         "paper_seconds": paper_seconds,
     }
     wanted = inspect.signature(function).parameters
