@@ -8,5 +8,7 @@ export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"  # two test processes, a thread e
 
 echo "test: format"; ruff format --check --quiet .
 echo "test: lint";   ruff check --quiet .
-echo "test: types";  mypy --no-error-summary
-echo "test: tests";  pytest --quiet -n 2 --dist worksteal -m "not slow and not gpu" "$@"
+echo "test: types and tests"  # mypy beside pytest, for it uses one core
+mypy --no-error-summary & types=$!
+pytest --quiet -n 2 --dist worksteal -m "not slow and not gpu" "$@"
+wait $types
