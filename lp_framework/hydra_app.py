@@ -18,11 +18,12 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, errors
+from omegaconf import DictConfig, ListConfig, OmegaConf, errors
 from yaml import YAMLError
 
 from lp_framework import catalogue, registry
 from lp_framework.errors import UserError, nearest, one_line
+from lp_framework.overrides import with_paths_as_text
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     other jobs go on first.
     """
     overrides, options = _parse(arguments)
+    overrides = _with_trainer_arguments(with_paths_as_text(command, overrides))
     registry.discover(catalogue.plugin_folders(overrides))
     for source, failure in registry.failures().items():
         print(f"warning: plugin {source} could not be loaded: {failure}", file=sys.stderr)
@@ -66,7 +68,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
         return
     _store_plugin_configs(options["config_dir"])
     if options["config_name"] is None:
-        _check_experiment(command, overrides)
+        options["multirun"] |= _check_experiment(command, overrides) and not (options["cfg"] or options["info"])
     failed: list[UserError] = []
     with _restored():
         sys.argv = [sys.argv[0], *overrides, *_as_words(options)]
@@ -97,6 +99,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             own += ["hydra.mode=RUN"] if sweep else []  # an experiment may ask for a sweep
             sys.argv = [sys.argv[0], command, *options, *own, *job.overrides.task]
             try:
+                _check_paths(config)  # before what computes is imported, which takes seconds
                 module = importlib.import_module(f"lp_framework.commands.{command}")
                 with _orderly_console():
                     module.run(config)
@@ -116,6 +119,29 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
 
     task.__module__ = f"lp_framework.commands.{command}"  # gives the job its name
     return task
+
+
+def _check_paths(config: DictConfig) -> None:
+    """`UserError` for a file or folder to be read that is not there."""
+    for key in ("images", "image", "masks", "resume", "runs"):
+        value = config.get(key)
+        of_files = key == "image" or (key == "images" and isinstance(value, ListConfig))
+        for path in value if isinstance(value, ListConfig) else [value]:
+            if isinstance(path, str) and not Path(path).exists():
+                raise UserError(
+                    f"{path}: there is no such file" if of_files else f"{key}={path}: there is no such folder"
+                )
+    checkpoint = str(config.get("checkpoint"))
+    if checkpoint.startswith(("runs/", "./", "../", "/")) and not Path(checkpoint).exists():
+        how = "" if checkpoint.endswith(".ckpt") else f"; to train it: lp train hydra.run.dir={checkpoint}"
+        raise UserError(f"checkpoint={checkpoint}: there is no such run{how}")
+    if "data" not in config:
+        return
+    if OmegaConf.is_missing(config.data, "path"):
+        raise UserError("data.path needs a value: give data.path=FOLDER")
+    of_the_user = registry.MISSING in catalogue.read(f"data/{config.data.name}").settings.get("path", [""])[0]
+    if of_the_user and not Path(config.data.path).exists():
+        raise UserError(f"data.path={config.data.path}: there is no such folder")
 
 
 def _leave_processes() -> None:
@@ -199,6 +225,19 @@ def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     return overrides, vars(options)
 
 
+def _with_trainer_arguments(overrides: Sequence[str]) -> list[str]:
+    """Arguments of Lightning's Trainer that the YAML files leave out are added, unless they look like a slip."""
+    files = [catalogue.read(f"trainer/{choice}") for choice in catalogue.choices("trainer")]
+    known = {key for file in files for key in file.settings}
+    names = {override: override.partition("=")[0].removeprefix("trainer.") for override in overrides}
+    others = {
+        override
+        for override, name in names.items()
+        if override.startswith("trainer.") and name.isidentifier() and name not in known and not nearest(name, known)
+    }
+    return [f"+{override}" if override in others else override for override in overrides]
+
+
 def _usage(message: str) -> NoReturn:
     raise UsageError(f"{message} (--help shows the options)")
 
@@ -209,12 +248,15 @@ def _as_words(options: Mapping[str, Any]) -> list[str]:
     return [word for name, value in given.items() for word in ([name] if value is True else [name, value])]
 
 
-def _check_experiment(command: str, overrides: Sequence[str]) -> None:
-    """`UsageError` for an experiment that belongs to other commands."""
+def _check_experiment(command: str, overrides: Sequence[str]) -> bool:
+    """Whether the experiment is a sweep; `UsageError` for one that belongs to other commands."""
+    sweep = False
     for experiment in [override.partition("=")[2] for override in overrides if override.startswith("experiment=")]:
         own = catalogue.experiments(command)
         if experiment not in own and catalogue.find(f"experiment/{experiment}"):
             raise UsageError(f"experiment={experiment} belongs to another command, not to {command} ({_known(own)})")
+        sweep |= "/sweep" in catalogue.read(f"experiment/{experiment}").defaults
+    return sweep
 
 
 def explain(error: Exception) -> str:
@@ -227,9 +269,13 @@ def explain(error: Exception) -> str:
             return f"{group}={choice} is not there ({_known(catalogue.choices(group))}); launchers come with {install}"
         case MissingConfigException(missing_cfg_file=str(file), options=options) if options is not None:
             group, _, choice = file.rpartition("/")
-            return f"{group}={choice}: there is no {group} '{choice}'{nearest(choice, options)} ({_known(options)})"
+            failed = "; some plugins could not be loaded, see above" if registry.failures() else ""
+            told = f"there is no {group} '{choice}'{nearest(choice, options)} ({_known(options)}){failed}"
+            return f"{group}={choice}: {told}"
         case OverrideParseException():
-            return f"cannot read '{error.override}': {one_line(error) if '=' in error.override else 'write KEY=VALUE'}"
+            key, equals, value = error.override.partition("=")
+            quoted = f"text with special characters as \"{key}='{value}'\", a list as {key}=[A,B]"
+            return f"cannot read '{error.override}': write {quoted if equals else 'KEY=VALUE'}"
         case errors.MissingMandatoryValue():
             return f"{error.full_key} needs a value: give {error.full_key}=VALUE"
         case HydraException() if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):

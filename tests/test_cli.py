@@ -101,6 +101,40 @@ def test_an_experiment_holds_differences(lp, walker):
     assert config_of(lp(*DEMO, "experiment=hike", "solver.steps=5", "--cfg", "job"))["solver"]["steps"] == 5
 
 
+def test_every_argument_of_the_trainer_can_be_given(lp):
+    ran = lp("train", "trainer.limit_train_batches=20", "trainer.max_epochs=2", "--cfg", "job")
+    assert config_of(ran)["trainer"]["limit_train_batches"] == 20
+    assert "did you mean 'max_epochs'" in lp("train", "trainer.max_epoch=2").error
+
+
+@pytest.mark.parametrize("choice", ["solver=langevin,sharp", "solver.gamma=0,1"])
+def test_an_experiment_that_is_a_sweep_needs_no_option_for_further_values(lp, monkeypatch, choice):
+    module = types.ModuleType("lp_framework.commands.eval")
+    module.run = lambda config: print(f"{config.solver.name} {config.seed}")
+    monkeypatch.setitem(sys.modules, "lp_framework.commands.eval", module)
+    ran = lp("eval", "experiment=gamma", "seed=3", choice, "hydra.sweep.dir=out")
+    assert ran.status == 0 and len(re.findall(r"^\w+ 3$", ran.out, re.MULTILINE)) in (2, 8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("eval", "data=meshes"), "data.path needs a value: give data.path=FOLDER"),
+        (("eval", "data=meshes", "data.path=gone"), "data.path=gone: there is no such folder"),
+        (
+            ("eval", "checkpoint=runs/gone"),
+            "checkpoint=runs/gone: there is no such run; to train it: lp train hydra.run",
+        ),
+        (("estimate", "a.png", "b.png"), "a.png: there is no such file"),
+        (("report", "runs=20240101"), "runs=20240101: there is no such folder"),
+    ],
+)
+def test_missing_files_are_named_before_anything_heavy_is_imported(lp, monkeypatch, arguments, sentence):
+    monkeypatch.setitem(sys.modules, f"lp_framework.commands.{arguments[0]}", None)  # importing it would fail
+    finished = lp(*arguments)
+    assert finished.status == 1 and finished.error.startswith(sentence)
+
+
 def test_an_experiment_of_another_command_says_whose_it_is(lp, write):
     for name, content in (("odd", "defaults: 3"), ("empty", "defaults:"), ("list", "[1]"), ("broken", "{")):
         write(f"odd/experiment/{name}.yaml", f"{content}\n")
@@ -249,7 +283,10 @@ def test_a_job_of_a_sweep_does_not_see_the_ranks_of_the_one_before(lp, jobs, mon
         ((*DEMO, "sed=1"), "sed: the configuration has no 'sed'; did you mean 'seed'?"),
         ((*DEMO, "solver=walk,jump"), "'solver=walk,jump' has several values: add --multirun to run each"),
         ((*DEMO, "seed=1,2"), "'seed=1,2' has several values: add --multirun to run each, or write a list, seed=[1,2]"),
-        ((*DEMO, "solver.gamma=[1"), "cannot read 'solver.gamma=[1': "),
+        (
+            (*DEMO, "solver.gamma=[1"),
+            "cannot read 'solver.gamma=[1': write text with special characters as \"solver.gamma='[1'\", a list as",
+        ),
         ((*DEMO, "walk"), "cannot read 'walk': write KEY=VALUE"),
         ((*DEMO, "model=3"), "Config group override must be a string or a list. Got int"),
         ((*DEMO, "hydra.run.dir=${nowhere}"), "Interpolation key 'nowhere' not found"),

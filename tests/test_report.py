@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from result_folders import metrics, write_job, write_result
+from rich.console import Console
 
 from lp_framework.errors import UserError
 from lp_framework.report.runs import checkpoint_setting, find_runs, read_run
 from lp_framework.report.sweep_figures import Curve, Panel, curves_figure, sweep_figure
-from lp_framework.report.sweep_tables import csv_rows, layout, sweep_tables, varying
+from lp_framework.report.sweep_tables import csv_rows, layout, sweep_tables, terminal, varying
 
 RECALLS = {0: (0.80, 0.82, 0.90), 0.3: (0.90, 0.91, 0.95)}  # by gamma, of seeds 0, 1, 2
 
@@ -319,6 +320,21 @@ def test_the_command_writes_tables_and_figures_and_names_what_it_left_out(lp, tm
     text = (out / "report.md").read_text()
     assert "![gamma](gamma.png)" in text and "*0.884*" in text and "0.840 ± 0.053" in text
     assert "- `sweep/stopped`: unfinished" in text
+
+
+@pytest.mark.parametrize("width", [60, 80, 110, 300])
+def test_a_terminal_of_any_width_shows_every_number_with_its_label(tmp_path, capsys, width):
+    ((table,), _) = tables_of(gamma_sweep(tmp_path), "unique_answer")
+    content, console = layout(table), Console(width=width)
+    parts = terminal(content, console.width)
+    for part in parts:
+        console.print(part)
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= width and "\N{HORIZONTAL ELLIPSIS}" not in shown
+    assert shown.count("solver.gamma") == len(parts)  # the labels, beside each part of the numbers
+    numbers = len(content.headings) - content.labels
+    assert sum(len(part.columns) for part in parts) == numbers + len(parts) * content.labels
+    assert len(parts) == (1 if width == 300 else len(parts)) and (width == 300 or len(parts) > 1)
 
 
 def test_several_folders_are_one_report(lp, tmp_path):

@@ -22,7 +22,7 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation import journal
 from lp_framework.evaluation.breakdown import breakdown, lines
 from lp_framework.evaluation.evaluation import Evaluation
-from lp_framework.evaluation.tables import RESULT, summary_rows, terminal_table, write_result
+from lp_framework.evaluation.tables import RESULT, summary_rows, terminal_tables, write_result
 from lp_framework.models.checkpoints import find_checkpoint
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.base import Solver
@@ -155,7 +155,9 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     choices = f"{config['data']['name']}, {config['solver']['name']}, start={config['start']['name']}"
     counted = f"pairs ({config['protocol']})" if views is None else f"poses in sets of {views} images"
-    console.print(terminal_table(f"{choices}, {result['pairs']} {counted}", summary_rows(result)))
+    title = f"{choices}, {result['pairs']} {counted}"
+    for table in terminal_tables(title, summary_rows(result), console.width):
+        console.print(table)
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
     told = result["breakdown"]
     if told and told["calibration"]:  # of a model that tells how sure it is

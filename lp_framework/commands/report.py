@@ -36,7 +36,8 @@ def run(config: DictConfig) -> None:
     for sweep in sweeps:
         console.print()
         console.print(Text(sweep.title, style="bold"), soft_wrap=True)
-        console.print(terminal(sweep.layout))
+        for table in terminal(sweep.layout, console.width):
+            console.print(table)
         for note in sweep.table.paper.notes if sweep.table.paper is not None else []:
             console.print(f"paper: {note}", style="dim", soft_wrap=True)
     console.print()

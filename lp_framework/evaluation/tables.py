@@ -22,6 +22,7 @@ from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, PoseMetrics
 RESULT = "results.json"  # of a finished evaluation
 COLUMNS = [f"{prefix}@{degrees}" for prefix in ("R", "R(R)", "SR", "SR(R)") for degrees in ROTATION_THRESHOLDS]
 ERRORS = ["rotation_error", "translation_error"]
+WIDE = 100  # columns of a terminal that hold the whole table
 
 
 def write_text(path: Path, text: str) -> None:
@@ -67,23 +68,32 @@ def summary_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, floa
     return [(name, metrics) for name, metrics in rows if metrics is not None]
 
 
-def terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]]) -> Table:
-    """The paper's layout: at each threshold R and R(R), then SR and SR(R), then the median errors."""
+def terminal_tables(title: str, rows: Sequence[tuple[str, Mapping[str, float]]], width: int) -> list[Table]:
+    """The paper's layout: at each threshold R and R(R), then SR and SR(R), then the median errors.
+
+    Where `width` columns do not hold it, the success rates are in a table of their own.
+    """
+    parts = [("R", "SR")] if width >= WIDE else [("R",), ("SR",)]
+    return [_terminal_table(title if part is parts[0] else "", rows, part) for part in parts]
+
+
+def _terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]], prefixes: Sequence[str]) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
     table.add_column("", no_wrap=True)
-    order = []
-    for prefix in ("R", "SR"):
+    order, errors = [], "R" in prefixes
+    for prefix in prefixes:
         for degrees in ROTATION_THRESHOLDS:
             order += [f"{prefix}@{degrees}", f"{prefix}(R)@{degrees}"]
             for label in (f"@{degrees}\n{prefix}", f"\n{prefix}(R)"):
                 table.add_column(label, justify="right", min_width=5, no_wrap=True)
-    table.add_column("Rot.\n(deg)", justify="right", min_width=6)
-    table.add_column("Trans.", justify="right", min_width=6)
+    for label in ("Rot.\n(deg)", "Trans.") if errors else ():
+        table.add_column(label, justify="right", min_width=6)
     for name, metrics in rows:
         shares = [metrics.get(key) for key in order]
         cells = ["-" if each is None else f"{each:.2f}".removeprefix("0") for each in shares]
         cells = ["1.0" if cell == "1.00" else cell for cell in cells]
-        table.add_row(name, *cells, f"{metrics['rotation_error']:.1f}", f"{metrics['translation_error']:.2f}")
+        cells += [f"{metrics['rotation_error']:.1f}", f"{metrics['translation_error']:.2f}"] if errors else []
+        table.add_row(name, *cells)
     return table
 
 

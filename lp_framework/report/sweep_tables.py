@@ -222,19 +222,44 @@ def layout(table: SweepTable) -> Layout:
     return _down(table) if axis is None else _across(table, axis)
 
 
-def terminal(content: Layout) -> Table:
-    """The layout for a terminal, which is narrow: spreads below the means, shares without the leading zero."""
+def terminal(content: Layout, width: int) -> list[Table]:
+    """The layout for a terminal: spreads below the means, shares without the leading zero.
+
+    Numbers that `width` columns do not hold go on in further tables, each with the labels.
+    """
+    rows = [
+        [
+            *cells[: content.labels],
+            *(re.sub(r"\b0\.", ".", each).replace(" ± ", "\n±") for each in cells[content.labels :]),
+        ]
+        for cells, _ in content.lines
+    ]
+    headings = [
+        name if place < content.labels else re.sub(r"(.+)@(\d+)", r"@\2\n\1", name).replace(" ", "\n")
+        for place, name in enumerate(content.headings)
+    ]
+    columns = list(zip(headings, *rows, strict=True))
+    wide = [2 + max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+    parts: list[list[int]] = []
+    room = 0
+    for place in range(content.labels, len(columns)):
+        if not parts or room < wide[place]:
+            parts.append([])
+            room = max(width - sum(wide[: content.labels]), wide[place])
+        parts[-1].append(place)
+        room -= wide[place]
+    return [_terminal_part(content, columns, part) for part in parts]
+
+
+def _terminal_part(content: Layout, columns: Sequence[Sequence[str]], numbers: Sequence[int]) -> Table:
     printed = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for place, name in enumerate(content.headings):
-        if place < content.labels:
-            printed.add_column(name, overflow="fold")
-        else:
-            prefix, at, degrees = name.partition("@")
-            told = f"@{degrees}\n{prefix}" if at else name.replace(" ", "\n")
-            printed.add_column(told, justify="right", no_wrap=True)
-    for cells, paper in content.lines:
-        numbers = [re.sub(r"\b0\.", ".", cell).replace(" ± ", "\n±") for cell in cells[content.labels :]]
-        printed.add_row(*cells[: content.labels], *numbers, style="dim" if paper else "")
+    places = [*range(content.labels), *numbers]
+    for place in places:
+        is_number = place >= content.labels
+        how: dict[str, Any] = {"justify": "right", "no_wrap": True} if is_number else {"overflow": "fold"}
+        printed.add_column(columns[place][0], **how)
+    for line, (_, paper) in enumerate(content.lines, start=1):
+        printed.add_row(*(columns[place][line] for place in places), style="dim" if paper else "")
     return printed
 
 

@@ -1,0 +1,61 @@
+"""Paths on the command line as people type them, written so that Hydra reads them as text and as nothing else.
+
+Hydra's grammar takes a folder called 20240101 for a number, and stops at the brackets, quotes and letters outside ASCII
+that file names have. Values of settings that hold paths are therefore put in quotes where they need them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+
+from lp_framework.errors import UserError
+
+# Settings that hold a path, or a list of paths.
+PATHS = re.compile(
+    r"(images?|masks|checkpoint|resume|path|output|runs|plugins|data\.views|hydra\.(run|sweep)\.dir"
+    r"|.+\.(path|labels|renderings|cache))"
+)
+PLAIN = re.compile(r"[\w./:@%+*?|-]+", re.ASCII)  # text to Hydra, unless it is one of the following
+OTHER_THAN_TEXT = re.compile(r"[-+]?[\d_]*\.?[\d_]+(e[-+]?\d+)?|[-+]?(inf|nan)|true|false", re.IGNORECASE)
+# What Hydra is to read itself: nothing, a quoted text, a function, an interpolation.
+HYDRAS_OWN = re.compile(r"null|\?\?\?|['\"].*|(choice|range|glob|interval|sort|shuffle|str)\(.*\)|.*\$\{.*", re.DOTALL)
+PLAIN_ARGUMENTS = {"estimate": "images"}  # the setting that arguments without a key give
+
+
+def with_paths_as_text(command: str, overrides: Sequence[str]) -> list[str]:
+    """The overrides with paths in quotes where Hydra needs them, and arguments without a key as a setting.
+
+    `lp estimate "IMG (1).png" b.png` becomes `images=['IMG (1).png',b.png]`.
+    """
+    key = PLAIN_ARGUMENTS.get(command)
+    plain = [each for each in overrides if key and "=" not in each and each[:1] not in ("~", "+", "")]
+    keyed = [_as_text(each) for each in overrides if each not in plain]
+    if plain and any(each.startswith(f"{key}=") for each in keyed):
+        raise UserError(f"give the {key} either as {key}=... or as arguments without a key, got both")
+    value = _quoted(plain[0]) if len(plain) == 1 else f"[{','.join(map(_quoted, plain))}]"
+    return [f"{key}={value}", *keyed] if plain else keyed
+
+
+def _as_text(override: str) -> str:
+    key, equals, value = override.partition("=")
+    if not equals or not PATHS.fullmatch(key.lstrip("+")) or HYDRAS_OWN.fullmatch(value):
+        return override
+    inside = value[1:-1] if value[:1] == "[" and value[-1:] == "]" else value
+    if any(quote in inside for quote in "'\"") and "," in inside:
+        return override  # whoever quotes one of several knows how
+    parts = ",".join(_quoted(part.strip()) for part in inside.split(","))
+    as_list = inside is not value or (key == "plugins" and value)
+    return f"{key}=[{parts}]" if as_list else f"{key}={parts}"
+
+
+def _quoted(path: str) -> str:
+    """A path as Hydra reads it as text; `~` at its beginning is the home folder."""
+    path = os.path.expanduser(path)
+    if not path or HYDRAS_OWN.fullmatch(path):
+        return path
+    if PLAIN.fullmatch(path) and not OTHER_THAN_TEXT.fullmatch(path):
+        return path
+    escaped = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), path)
+    return f"'{escaped}'"
