@@ -218,7 +218,7 @@ def test_peak_memory_is_that_of_the_weights_kept_and_the_modules_import_nothing_
 
 
 def test_a_file_that_is_missing_or_no_checkpoint(tmp_path):
-    assert "No such file" in refused(tmp_path / "absent.ckpt")
+    assert "there is no such file" in refused(tmp_path / "absent.ckpt")
     text = tmp_path / "text.ckpt"
     text.write_text("<html>404</html>")
     assert "no PyTorch checkpoint" in refused(text)
@@ -386,6 +386,23 @@ def test_the_other_layout_in_circulation(networks, folder, tmp_path):
     assert all(torch.equal(tensor, half[name]) for name, tensor in other.unet.state_dict().items())
 
 
+def test_weights_in_shards_with_an_index(folder, networks, tmp_path):
+    path = copied(folder, tmp_path / "sharded")
+    whole = path / "unet" / "diffusion_pytorch_model.safetensors"
+    tensors = load_file(whole)
+    whole.unlink()
+    shards = {f"{whole.stem}-0000{number}-of-00002.safetensors": number for number in (1, 2)}
+    owners = {name: [*shards][place % 2] for place, name in enumerate(tensors)}
+    for shard in shards:
+        save_file({name: tensor for name, tensor in tensors.items() if owners[name] == shard}, whole.with_name(shard))
+    whole.with_name(f"{whole.name}.index.json").write_text(json.dumps({"weight_map": owners}))
+    assert same(load_networks(str(path), None, "ema", "float32"), networks)
+    whole.with_name([*shards][1]).unlink()
+    assert "-00002-of-00002.safetensors: is no safetensors file" in refused(path)
+    whole.with_name(f"{whole.name}.index.json").write_text("[]")
+    assert "names no files of weights" in refused(path)
+
+
 def test_bad_folders(folder, tmp_path):
     (tmp_path / "empty").mkdir()
     assert "holds no pose projection" in refused(tmp_path / "empty")
@@ -444,7 +461,8 @@ def test_the_convert_command(lp, checkpoint, networks, tmp_path):
     assert "exists already" in lp("convert", f"path={checkpoint}", "output=converted").error
     assert "did you mean 'raw'?" in lp("convert", f"path={checkpoint}", "output=other", "weights=row").error
     assert "path needs a value" in lp("convert", "output=other").error
-    assert "No such file" in lp("convert", "path=absent.ckpt", "output=other").error
+    missing = lp("convert", "path=absent.ckpt", "output=other").error
+    assert "absent.ckpt: there is no such file or folder; get 105000.ckpt or zero123-xl.ckpt" in missing
 
 
 # ---------------------------------------------------------------- the hub

@@ -21,7 +21,11 @@ from lp_framework.priors.zero123.tensor_files import StoredTensor, read_safetens
 PARTS, PROJECTIONS = ("unet", "vae", "image_encoder"), ("cc_projection", "clip_camera_projection")
 WEIGHT_FILES = [  # of diffusers and of transformers, best first
     f"{stem}{variant}.{suffix}"
-    for suffix, transformers in (("safetensors", "model"), ("bin", "pytorch_model"))
+    for suffix, transformers in (
+        ("safetensors", "model"),
+        ("safetensors.index.json", "model"),
+        ("bin", "pytorch_model"),
+    )
     for variant in ("", ".fp16")
     for stem in ("diffusion_pytorch_model", transformers)
 ]
@@ -39,6 +43,11 @@ def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dty
         place = download(path, revision)
     elif revision is not None:
         raise UserError(f"prior.revision={revision} is for ids of the Hugging Face hub, and {path} is a file")
+    if not place.exists():
+        raise UserError(
+            f"{path}: there is no such file or folder; get 105000.ckpt or zero123-xl.ckpt from the authors of Zero123 "
+            "and run `lp convert` on it (see Zero123 in the README), or give an id of the Hugging Face hub, owner/name"
+        )
     if not place.is_dir():
         return assemble(path, *read_original(place, weights), dtype)
     if weights == "raw":
@@ -57,7 +66,8 @@ def download(hub_id: str, revision: str | None) -> Path:
         names, needed = HfApi().list_repo_files(hub_id, revision=revision), []
         for part in (*PARTS, *PROJECTIONS):
             best = [f"{part}/{name}" for name in WEIGHT_FILES if f"{part}/{name}" in names]
-            needed += [f"{part}/config.json", *best[:1]]
+            shards = [f"{part}/*.safetensors"] if best and best[0].endswith(".index.json") else []
+            needed += [f"{part}/config.json", *best[:1], *shards]
         folder = snapshot_download(hub_id, revision=revision, allow_patterns=needed)
     except Exception as error:  # each HTTP library that the hub's package has used tells it its own way
         try:
@@ -88,8 +98,20 @@ def _weights(folder: Path) -> dict[str, StoredTensor]:
     file = next((folder / name for name in WEIGHT_FILES if (folder / name).is_file()), None)
     if file is None:
         raise UserError(f"{folder}: holds no weights, none of {', '.join(WEIGHT_FILES)}")
-    tensors = read_state_dict(file) if file.suffix == ".bin" else read_safetensors(file)
+    read = read_state_dict if file.suffix == ".bin" else read_safetensors
+    tensors = {name: stored for each in _shards(file) for name, stored in read(each).items()}
     return {name: stored for name, stored in tensors.items() if name not in LEFT_OVER}
+
+
+def _shards(file: Path) -> list[Path]:
+    """The files of weights that an index names, or the file itself."""
+    if file.suffix != ".json":
+        return [file]
+    index = read_json(file)
+    owners = index.get("weight_map") if isinstance(index, dict) else None
+    if not isinstance(owners, dict) or not owners:
+        raise UserError(f"{file}: names no files of weights; download it again")
+    return [file.with_name(name) for name in sorted({*map(str, owners.values())})]
 
 
 def write_folder(networks: Networks, path: Path) -> None:
