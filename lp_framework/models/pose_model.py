@@ -145,7 +145,7 @@ class DenoisingModel(PoseModel):
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch))
         if self.view_loss > 0:
             view_loss = relative_pose_loss(self.view_head["readout"](features), batch)
-            self.log("train/view_loss", view_loss, prog_bar=True, batch_size=len(batch))
+            self.log("train/view_loss", view_loss, batch_size=len(batch))
             loss = loss + self.view_loss * view_loss
         return loss
 

@@ -95,8 +95,8 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
     for (name, curve), colour in zip(losses.items(), (REFERENCE, ANSWER, GREY), strict=False):
         line = {"color": colour, "width": 2}
         if (window := len(curve.step) // 20) > 1:
-            pale = {"line": {**line, "width": 1}, "opacity": 0.3, "hoverinfo": "skip", "showlegend": False}
-            figure.add_scatter(**_thinned(curve), mode="lines", **pale)
+            pale = {"marker": {"color": colour, "size": 3}, "opacity": 0.3, "hoverinfo": "skip", "showlegend": False}
+            figure.add_scatter(**_thinned(curve), mode="markers", **pale)
             curve = Curve(curve.step, running_mean(curve.value, window))
         mode = "lines" if len(curve.step) > 30 else "lines+markers"
         figure.add_scatter(**_thinned(curve), name=LOSSES[name][1], mode=mode, line=line)

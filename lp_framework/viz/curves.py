@@ -159,7 +159,7 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
         window = len(curve.step) // 20
         if window > 1:
             # Single batches scatter: they stay visible, pale, behind their running mean.
-            above.plot(*curve, color=colour, linewidth=0.6, alpha=0.3, zorder=1)
+            above.plot(*curve, color=colour, marker=".", markersize=2.5, linestyle="none", alpha=0.3, zorder=1)
             curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean of {window} records"
         marker = "" if len(curve.step) > 30 else "o"
         above.plot(*curve, color=colour, label=label, clip_on=False, marker=marker, markersize=3.5)

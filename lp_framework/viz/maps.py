@@ -334,7 +334,7 @@ def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
 @styled
 def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -> Figure:
     """(a), (b) both images; (c) a row a trajectory, of `views` `[N, K, H, W, 3]` at `steps`; (d) the landscape."""
-    view, label, bottom = 0.58, 0.5, 0.06
+    view, label, bottom = 0.58, 0.6, 0.06
     tall = max(2.7, 0.18 + len(views) * (view + GAP) - GAP)
     image = min(1.1, (tall - TITLE) / 2)
     sheet = Sheet(WIDTH, TITLE + tall + bottom)

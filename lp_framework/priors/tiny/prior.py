@@ -111,7 +111,7 @@ class PriorModel(TrainedModule):
 
         loss = error.mean()
         for name, value in (("loss", loss), ("view_loss", view_loss), ("image_loss", image_loss)):
-            self.log(f"train/{name}", value, prog_bar=True, batch_size=len(batch))
+            self.log(f"train/{name}", value, prog_bar=name == "loss", batch_size=len(batch))
         return loss + self.view_loss * view_loss + image_loss
 
     def validation_step(self, batch: PairBatch, batch_idx: int) -> None:
