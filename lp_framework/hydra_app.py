@@ -135,7 +135,7 @@ def _check_paths(config: DictConfig) -> None:
     if checkpoint.startswith(("runs/", "./", "../", "/")) and not Path(checkpoint).exists():
         how = "" if checkpoint.endswith(".ckpt") else f"; to train it: lp train hydra.run.dir={checkpoint}"
         raise UserError(f"checkpoint={checkpoint}: there is no such run{how}")
-    if "data" not in config:
+    if "data" not in config or config.get("image") or config.get("images"):  # which are used instead
         return
     if OmegaConf.is_missing(config.data, "path"):
         raise UserError("data.path needs a value: give data.path=FOLDER")

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
+from toy_views import toy_view
 
-from lp_framework.analysis.confidence import DOUBT, TRUST, Answer, answers, in_words
+from lp_framework.analysis.confidence import DOUBT, TRUST, Answer, answers, answers_by_prior, in_words
+from lp_framework.api import load_prior, view_set
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.geometry import camera_to_world
 from lp_framework.solvers.base import Cost, Solution
@@ -85,3 +88,17 @@ def test_nothing_is_told_without_a_probability_or_a_pose():
     assert answers(Solution(silent.poses, silent.energies, silent.valid, silent.chosen, silent.cost)) == []
     (failed,) = answers(solution([(math.nan, 0, math.nan), (math.nan, 0, math.nan)]))
     assert (failed.words, failed.verdict, failed.second) == ("no pose", "", None)
+
+
+@pytest.mark.parametrize(("recoloured", "verdict"), [(False, "trust"), (True, "do not trust")])
+def test_a_prior_tells_objects_that_it_knows_from_others(recoloured, verdict):
+    views = [toy_view("duck", *place) for place in ((6, 17), (-11, 69))]
+    if recoloured:
+        pixels = [np.asarray(view) for view in views]
+        views = [Image.fromarray(np.concatenate([255 - each[..., :3] // 2, each[..., 3:]], -1)) for each in pixels]
+    pairs, prior = view_set(views, torch.device("cpu")).with_first(), load_prior("tiny")
+    true = torch.deg2rad(torch.tensor([[-17.0, 52.0, 0.0]]))
+    (answer,) = answers_by_prior(prior, pairs, true)
+    assert answer.verdict == verdict and "what it is for objects that the prior knows" in answer.reason
+    prior.usual_error = None
+    assert answers_by_prior(prior, pairs, true) == []

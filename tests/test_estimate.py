@@ -395,7 +395,13 @@ def test_a_prior_may_still_choose_among_the_modes(lp, tmp_path: Path):
     finished = lp("estimate", f"images=[{','.join(files)}]", *settings)
     assert finished.status == 0, finished.err
     assert "prior=tiny as it ships knows the twelve embedded objects" in finished.err
-    assert all(row[key] == "" for row in rows(tmp_path / "run") for key in CONFIDENCE)
+    first, second = rows(tmp_path / "run")
+    assert second["probability"] == "" and first["verdict"] == ""
+    assert second["verdict"] in ("doubtful", "do not trust")  # it knows the object, but not crops of it
+    assert "times what it is for objects that the prior knows: do" in finished.out
+    assert second["verdict"] in (tmp_path / "run" / "report.html").read_text()
+    whole = lp("estimate", *files, *settings[:2], "crop=false", "hydra.run.dir=whole")
+    assert rows(tmp_path / "whole")[1]["verdict"] == "trust" and whole.err == ""
 
 
 def test_masks_are_made_written_and_shown(lp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,15 +1,24 @@
-"""What an answer is worth, for people: how probable it is, what else the pair may mean, and whether to trust it."""
+"""What an answer is worth, for people: how probable it is, what else the pair may mean, and whether to trust it.
+
+Models with a density tell a probability. A prior tells by its denoising error whether it knows such objects at all; an
+answer in a wrong valley of an object that it knows may still have a low one.
+"""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from lp_framework.geometry import wrap_angle
-from lp_framework.solvers.base import Solution
+from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs, Solution
+from lp_framework.solvers.pair_energy import PairEnergy
 
+TIMESTEPS, NOISES = range(50, 1000, 100), 2  # thousandths of a prior's timesteps, and noises at each, for its error
+FAMILIAR, STRANGE = 2.0, 3.0  # times a prior's usual error up to which an answer is to be trusted, or only doubtful
 NEAR_DEGREES = 30.0  # of `Solution.probability`
 TRUST, DOUBT = 0.8, 0.5  # probabilities from which an answer is to be trusted, and from which it is only doubtful
 WORTH_TELLING = 0.05  # probability of a second answer
@@ -17,12 +26,14 @@ WORTH_TELLING = 0.05  # probability of a second answer
 
 class Answer(NamedTuple):
     """The answer to a pair and, if any, a second one: latitude and longitude (radians), relative to the reference, and
-    the probability that the true rotation is within 30 degrees of it."""
+    the probability that the true rotation is within 30 degrees of it, NaN where no model told one; then `strangeness`
+    is the prior's denoising error in units of its usual one."""
 
     latitude: float
     longitude: float
     probability: float
     second: Answer | None = None
+    strangeness: float = math.nan
 
     @property
     def words(self) -> str:
@@ -31,10 +42,21 @@ class Answer(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """`trust`, `doubtful` or `do not trust`; nothing where no pose was found."""
-        if not math.isfinite(self.probability):
+        """`trust`, `doubtful` or `do not trust`; nothing where no pose was found or nothing is known."""
+        if math.isfinite(self.probability):
+            grade = (self.probability < TRUST) + (self.probability < DOUBT)
+        elif math.isfinite(self.strangeness):
+            grade = (self.strangeness > FAMILIAR) + (self.strangeness > STRANGE)
+        else:
             return ""
-        return "trust" if self.probability >= TRUST else "doubtful" if self.probability >= DOUBT else "do not trust"
+        return ("trust", "doubtful", "do not trust")[grade]
+
+    @property
+    def reason(self) -> str:
+        """What the verdict rests on."""
+        if math.isfinite(self.probability):
+            return f"probability {self.probability:.2f} to be within {NEAR_DEGREES:.0f}\N{DEGREE SIGN}"
+        return f"denoising error {self.strangeness:.1f} times what it is for objects that the prior knows"
 
     @property
     def second_words(self) -> str:
@@ -60,6 +82,21 @@ def answers(solution: Solution | None) -> list[Answer]:
         second = _answer(poses[other], shares[other]) if apart[other] and shares[other] >= WORTH_TELLING else None
         found.append(_answer(poses[first], shares[first])._replace(second=second))
     return found
+
+
+def answers_by_prior(prior: Prior, pairs: Pairs, poses: Tensor) -> list[Answer]:
+    """Answers `poses` `[B, 3]` to pairs with their strangeness to the prior; empty where its usual error is unknown."""
+    if prior.usual_error is None:
+        return []
+    energy = PairEnergy(prior, pairs, seed=0)
+    timesteps = [timestep * prior.num_timesteps // 1000 for timestep in TIMESTEPS for _ in range(NOISES)]
+    with torch.no_grad():
+        errors = energy.mean(poses[:, None], timesteps, energy.noise(0, len(timesteps)))[:, 0]
+    strangeness = (errors / prior.usual_error).tolist()
+    return [
+        Answer(latitude, longitude, math.nan, strangeness=times)
+        for (latitude, longitude, _), times in zip(poses.tolist(), strangeness, strict=True)
+    ]
 
 
 def in_words(latitude: float, longitude: float) -> str:

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from lp_framework.analysis.confidence import NEAR_DEGREES, Answer, answers
+from lp_framework.analysis.confidence import Answer, answers, answers_by_prior
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
 from lp_framework.data.masks import mask_maker
@@ -59,6 +59,8 @@ def run(config: DictConfig) -> None:
     relative = torch.cat([torch.zeros(1, 3, dtype=torch.float64), solution.poses[0].detach().cpu().double()])
     told = answers(solution.pairs)
     radius_lost = config.crop and bool(told)
+    if not told and "prior" in components.needs("solver"):
+        told = answers_by_prior(components["prior"], view_sets.with_first(), solution.poses[0])
     if radius_lost:
         relative[:, 2] = 0.0
     absolute = apply_relative_pose(first, relative)
@@ -82,7 +84,8 @@ def run(config: DictConfig) -> None:
             save_png(folder / MASKS / f"{index:03d}.png", photograph.mask)
     rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist(), told)
     _print(folder, rows, told, radius_lost, result["masks_by"] is not None)
-    warn_of_prior(components)
+    if not told or any(answer.verdict != "trust" for answer in told):
+        warn_of_prior(components)
 
 
 def warn_of_prior(components: Components) -> None:
@@ -99,6 +102,7 @@ def _record(file: Path, answer: Answer) -> dict[str, Any]:
         "answer": answer.words,
         "probability": answer.probability,
         "verdict": answer.verdict,
+        "reason": answer.reason,
         "second": None if second is None else dict(zip(COLUMNS[-3:], _second(second), strict=True)),
     }
 
@@ -157,7 +161,8 @@ def _notes(answer: Answer) -> list[Any]:
     if not answer.verdict:
         return [""] * 6
     second = ["", "", ""] if answer.second is None else _second(answer.second)
-    return [answer.words, round(answer.probability, 4), answer.verdict, *second]
+    probability = "" if math.isnan(answer.probability) else round(answer.probability, 4)
+    return [answer.words, probability, answer.verdict, *second]
 
 
 def _print(
@@ -178,8 +183,7 @@ def _print(
     console.print(table)
     for (file, *_), answer in zip(rows[1:], told, strict=bool(told)):
         way = f"{rows[0][0].name} to {file.name}: {answer.words}"
-        chance = f"probability {answer.probability:.2f} to be within {NEAR_DEGREES:.0f}°"
-        console.print(f"{way}; {chance}: {answer.verdict}" if answer.verdict else way, soft_wrap=True)
+        console.print(f"{way}; {answer.reason}: {answer.verdict}" if answer.verdict else way, soft_wrap=True)
         if answer.second_words:
             console.print(f"  second: {answer.second_words}", soft_wrap=True)
     if radius_lost:

@@ -15,7 +15,7 @@ from rich.console import Console
 from lp_framework.analysis.fields import generated_views, grid_poses
 from lp_framework.analysis.pairs import object_index, words
 from lp_framework.api import image_batch
-from lp_framework.commands.building import begin
+from lp_framework.commands.building import begin, plain, warn_of_photographs
 from lp_framework.data.photographs import on_white, prepare, prepared_photographs, read_image, save_png
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_json
@@ -66,6 +66,8 @@ def run(config: DictConfig) -> None:
     settings = f"steps {config.steps}, guidance {config.guidance:g}, eta {config.eta:g}, seed {config.seed}"
     note = f"prior {config.prior.name}, {settings}"
     save_figure(views_figure(on_white(image), views, latitudes, longitudes, name, note), folder / "views")
+    if config.image is not None:
+        warn_of_photographs(plain(config.prior))
     console = Console(soft_wrap=True, highlight=False)
     console.print(f"views:   {folder / FOLDER} ({len(records)} files)")
     console.print(f"poses:   {folder / 'views.json'}")

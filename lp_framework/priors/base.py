@@ -38,6 +38,9 @@ class Prior(nn.Module, ABC):
     num_timesteps: int  # timesteps are integers from 0 (hardly any noise) to num_timesteps - 1
     latent_shape: tuple[int, int, int]  # of an image's latent, and so of the noise
     image_size: int  # pixels a side of the images that the prior sees and generates
+    usual_error: float | None = (
+        None  # mean denoising error at true poses of objects like those that it has met, if known
+    )
 
     @abstractmethod
     def encode(self, images: Tensor) -> ViewCode:

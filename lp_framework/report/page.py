@@ -311,10 +311,12 @@ def _estimate(folder: Path) -> RunPart:
 def _about_estimate(folder: Path, result: Record) -> About:
     rows = read_rows(folder / "poses.csv")
     found = sum(row["valid"] == "True" for row in rows)
+    verdicts = Counter(row.get("verdict") for row in rows)
+    judged = {each: str(verdicts[each]) for each in ("trust", "doubtful", "do not trust") if verdicts[each]}
     return (
         f"Cameras by {words(result['config']['solver']['name'])}",
         "camera poses of photographs; the first is the reference",
-        {"photographs": str(len(rows)), "with a pose": str(found), "seconds": f"{result['seconds']:.3g}"},
+        {"photographs": str(len(rows)), "with a pose": str(found), **judged, "seconds": f"{result['seconds']:.3g}"},
     )
 
 

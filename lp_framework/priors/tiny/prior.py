@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from lp_framework.data.files import read_json
 from lp_framework.data.module import FeatureExtractor
 from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import keyed_bits, keyed_normal
 from lp_framework.models.backbones import Backbone
-from lp_framework.models.checkpoints import SHIPPED, find_checkpoint, read_checkpoint, restore
+from lp_framework.models.checkpoints import FOLDER, SHIPPED, find_checkpoint, read_checkpoint, restore
 from lp_framework.models.pair_mean import PairMean
 from lp_framework.models.trained_module import TrainedModule
 from lp_framework.models.view_head import relative_pose_loss
@@ -160,6 +161,9 @@ class TinyPrior(Prior):
         self.num_timesteps = len(self.model.alphas_cumprod)
         self.latent_shape = (self.model.networks.latent_dim, 1, 1)
         self.image_size = IMAGE_SIZE
+        run = file.parents[1] if file.parent.name == FOLDER else file.parent
+        if (run / "training.json").is_file():
+            self.usual_error = read_json(run / "training.json").get("final", {}).get("val/loss")
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> ViewCode:
