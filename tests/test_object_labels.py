@@ -34,6 +34,13 @@ def test_labels_by_object(file):
     }
 
 
+def test_numbers_and_other_words_of_yaml_are_names_as_they_are_written(file):
+    names = ["42", "007", "1.50", "1_000", "2024-01-01", "12:30", "0x10", "yes", "null", "~", "mug"]
+    file.write_text("".join(f"{name}: {{ambiguity: unique}}\n" for name in names[:-1]) + '"mug": {ambiguity: twofold}')
+    labels = read_labels(file, names, Path("meshes"))
+    assert list(labels) == names and [labels[name].ambiguity for name in names] == ["unique"] * 10 + ["twofold"]
+
+
 def test_objects_that_are_left_out_are_named(file):
     with pytest.warns(UserWarning, match=r"labels\.yaml: leaves out, so that they stay unlabelled: mug, vase$"):
         assert read(file, "teapot: {ambiguity: unique}") == {"teapot": Label(ambiguity="unique")}
@@ -59,6 +66,8 @@ def test_objects_that_are_left_out_are_named(file):
         ("", r"must give every object its label"),
         ("mug: {ambiguity: unique", r"is not readable YAML \("),
         ("mug: \0", r"is not readable YAML \("),
+        ("? [mug]\n: {ambiguity: unique}", r"is not readable YAML \("),
+        ("mug: {}\n---\nvase: {}", r"is not readable YAML \("),
     ],
 )
 def test_bad_files(file, text, message):

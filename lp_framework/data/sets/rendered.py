@@ -51,13 +51,17 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
     missing, no YAML, not in the folder, or no label.
     """
     with expecting(f"{path}: is not readable YAML"):
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+        node = loader.get_single_node()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            key.tag = "tag:yaml.org,2002:str"  # 42 and 007 are names, as they are written
+        content = None if node is None else loader.construct_document(node)
     if not isinstance(content, dict):
         raise UserError(f"{path}: must give every object its label, as in 'mug: {{ambiguity: unique}}'")
     labels = {}
     for name, label in content.items():
         if name not in names:
-            raise UserError(f"{path}: {where} has no object '{name}'{nearest(str(name), names)}")
+            raise UserError(f"{path}: {where} has no object '{name}'{nearest(name, names)}")
         try:
             labels[name] = Label.model_validate(label)
         except ValidationError as error:
