@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from drawn_photographs import drawn, placed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, features
 
 from lp_framework.data.cache import decoded_views
 from lp_framework.data.masks import mask_maker
@@ -28,6 +29,7 @@ from lp_framework.data.photographs import (
     photograph_files,
     prepare,
     read_image,
+    read_mask,
     read_photographs,
     upright,
 )
@@ -115,16 +117,29 @@ def in_modes(alpha: NDArray[np.uint8]) -> dict[str, Image.Image]:
     """A mask of two levels as people save them."""
     mask = alpha >= 128
     palette = Image.fromarray(mask.astype(np.uint8)).convert("P")
-    palette.putpalette([0, 0, 0, 128, 0, 0] + [0] * 756)  # dark red, as segmentation sets have it
+    palette.putpalette([0, 0, 0, 64, 0, 0] + [0] * 756)  # dark red, as segmentation sets have it
+    white_first = Image.fromarray((~mask).astype(np.uint8)).convert("P")
+    white_first.putpalette([255, 255, 255, 0, 0, 0] + [0] * 756)
     cutout = Image.new("RGBA", mask.shape[::-1], (9, 9, 9, 0))
     cutout.paste((9, 9, 9, 255), mask=Image.fromarray(mask))
+    blue = np.zeros((*mask.shape, 3), np.uint8)
+    blue[mask] = [0, 0, 255]
+    opaque = Image.fromarray(mask.astype(np.uint8)).convert("RGBA")
     return {
         "grey": Image.fromarray(mask.astype(np.uint8) * 255),
         "one bit": Image.fromarray(mask),
         "zeros and ones": Image.fromarray(mask.astype(np.uint8)),
+        "zeros and ones, opaque": opaque,
         "colour": Image.fromarray(mask.astype(np.uint8) * 255).convert("RGB"),
+        "blue": Image.fromarray(blue),
         "palette": palette,
+        "palette, white first": white_first,
         "16 bits": Image.fromarray(mask.astype(np.uint16) * 65535),
+        "16 bits, zeros and ones": Image.fromarray(mask.astype(np.uint16)),
+        "16 bits, 255": Image.fromarray(mask.astype(np.uint16) * 255),
+        "16 bits, a number": Image.fromarray(mask.astype(np.uint16) * 1003),
+        "32 bits": Image.fromarray(mask.astype(np.int32) * 100_003),
+        "floats": Image.fromarray(mask.astype(np.float32)),
         "cut-out": cutout,
     }
 
@@ -132,13 +147,87 @@ def in_modes(alpha: NDArray[np.uint8]) -> dict[str, Image.Image]:
 @pytest.mark.parametrize("mode", in_modes(drawn()[..., 3]))
 def test_a_mask_file_does_what_the_same_alpha_channel_does(mode: str, tmp_path: Path):
     image = np.asarray(placed(drawn(), 20, 30)).copy()
-    mask = saved(in_modes(image[..., 3])[mode], tmp_path / "mask.png")
+    mask = in_modes(image[..., 3])[mode]
+    mask = saved(mask, tmp_path / f"mask.{'tif' if mask.mode in 'IF' else 'png'}")
     image[..., 3] = np.where(image[..., 3] >= 128, 255, 0)
     expected = prepare(Image.fromarray(image), "a")
     photograph = Image.fromarray(image[..., :3])
-    assert np.array_equal(prepare(photograph, "a", read_image(mask)), expected)
+    assert np.array_equal(prepare(photograph, "a", read_mask(mask)), expected)
     photograph.putalpha(255)
-    assert np.array_equal(prepare(photograph, "a", read_image(mask)), expected)
+    assert np.array_equal(prepare(photograph, "a", read_mask(mask)), expected)
+
+
+def labelled(*numbers: int) -> NDArray[np.int64]:
+    """A mask whose object has these numbers, in stripes."""
+    inside = np.asarray(placed(drawn(120, 80), 20, 30))[..., 3] >= 128
+    stripes = np.asarray(numbers)[np.arange(300) * len(numbers) // 160 % len(numbers)]
+    return np.where(inside, stripes, 0)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "dtype"),
+    [((1, 2), np.uint8), ((1, 2, 3), np.uint16), ((80, 160, 240), np.uint8), ((26001, 26002), np.uint16)],
+)
+def test_the_labels_of_several_parts_are_the_object(numbers: tuple[int, ...], dtype: type):
+    levels = labelled(*numbers)
+    photograph = Image.new("RGB", (300, 200), (90, 120, 40))
+    expected = prepare(photograph, "a", Image.fromarray(levels > 0))
+    with pytest.warns(UserWarning, match=rf"a: its mask has {len(numbers)} labels; all are taken for the object"):
+        assert np.array_equal(prepare(photograph, "a", Image.fromarray(levels.astype(dtype))), expected)
+    palette = Image.fromarray(np.unique(levels, return_inverse=True)[1].astype(np.uint8).reshape(200, 300))
+    palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0] + [0] * 756)  # of DAVIS and VOC
+    for mask in (palette, palette.convert("RGB")):
+        with pytest.warns(UserWarning, match=f"{len(numbers)} labels"):
+            assert np.array_equal(prepare(photograph, "a", mask), expected)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_a_soft_mask_of_few_levels_is_not_taken_for_labels(factor: int):
+    small = Image.fromarray((labelled(1)[:, ::-1] * 255).astype(np.uint8))
+    levels = np.round(np.asarray(small.reduce(factor)) / 64) * 64
+    mask = Image.fromarray(levels.clip(0, 255).astype(np.uint8))
+    photograph = Image.new("RGB", mask.size)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opacity = np.asarray(cut_out(photograph, "a", mask).getchannel("A"))
+    np.testing.assert_array_equal(opacity, np.asarray(mask))
+
+
+def test_a_picture_is_no_mask():
+    picture = Image.fromarray(drawn()[..., :3])
+    with pytest.raises(UserError, match=r"a: its mask is a picture of more than 16 colours; a mask is black and white"):
+        prepare(picture, "a", picture)
+
+
+def test_what_is_said_of_a_mask_without_object_is_true():
+    photograph, levels = Image.new("RGB", (300, 200)), np.asarray(placed(drawn(120, 80), 20, 30))[..., 3]
+    with pytest.raises(UserError, match="a: nothing in its mask is at least half opaque, at most 40%"):
+        prepare(photograph, "a", Image.fromarray((levels * 0.4).astype(np.uint8)))
+    for everywhere in (1, 100, 255):
+        with pytest.raises(UserError, match="a: its mask marks no background, which must be black"):
+            prepare(photograph, "a", Image.new("L", photograph.size, everywhere))
+
+
+@pytest.mark.parametrize("size", [(300, 200), (900, 1200)])
+def test_stray_pixels_far_from_the_object_are_left_out(size: tuple[int, int]):
+    """In a mask as in an alpha channel; an island in a hole is no stray, nor is half of the object."""
+    cut = np.asarray(placed(drawn(120, 80), 20, 30, *size)).copy()
+    cut[60:64] = 0
+    cut[66:74, 60:76, 3] = 0
+    cut[70, 68, 3] = 255
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of two parts
+        expected = prepare(Image.fromarray(cut), "a")
+    stray = cut.copy()
+    stray[-3, -2, 3], stray[-9:-6, 5:9, 3] = 255, 255
+    message = "a: its mask has 13 pixels that lie apart from the object; they are left out"
+    for image, mask in ((stray, None), (stray[..., :3], stray[..., 3])):
+        with pytest.warns(UserWarning) as told:
+            mask = None if mask is None else Image.fromarray(mask)
+            assert np.array_equal(prepare(Image.fromarray(image), "a", mask), expected)
+        assert message in [str(each.message) for each in told]
+    separate = "a: its mask has 2 separate parts, which are all taken for the object"
+    assert (size == (300, 200)) == (separate in [str(each.message) for each in told])  # in the other the gap is thin
 
 
 def test_soft_masks_keep_their_edges():
@@ -308,9 +397,28 @@ def test_photographs_are_those_of_a_folder_by_name_or_of_a_list_as_given(tmp_pat
     image = Image.fromarray(drawn())
     for name in ("b.png", "a.PNG", "c.webp", ".hidden.png"):
         image.save(tmp_path / name)
-    (tmp_path / "notes.txt").touch()
-    assert [file.name for file in photograph_files(tmp_path)] == ["a.PNG", "b.png", "c.webp"]
+    for name in ("notes.txt", "cameras.json", ".DS_Store"):
+        (tmp_path / name).touch()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert [file.name for file in photograph_files(tmp_path)] == ["a.PNG", "b.png", "c.webp"]
     assert photograph_files(["z.png", "a.png"]) == [Path("z.png"), Path("a.png")]
+
+
+def test_photographs_of_telephones_and_browsers_are_read_or_named(tmp_path: Path):
+    image = Image.fromarray(drawn()[..., :3])
+    for name, kind in (("a.jfif", "jpeg"), ("b.JPE", "jpeg"), ("c.gif", "gif")):
+        image.save(tmp_path / name, kind)
+    if features.check("avif"):
+        image.save(tmp_path / "d.avif")
+    for name in ("e.HEIC", "f.heif", "g.dng", "h.CR2", "i.jxl", "j.mov", "k"):
+        (tmp_path / name).touch()
+    message = r"files that are not read: e\.HEIC, f\.heif, g\.dng, h\.CR2, i\.jxl and 2 more; save photographs as PNG"
+    with pytest.warns(UserWarning, match=message):
+        files = photograph_files(tmp_path)
+    assert [file.suffix for file in files] == [".jfif", ".JPE", ".gif", ".avif"][: len(files)] and len(files) >= 3
+    for file in files:
+        np.testing.assert_allclose(np.asarray(read_image(file))[20, 30].astype(int), drawn()[20, 30, :3], atol=12)
 
 
 def test_too_few_photographs(tmp_path: Path):
@@ -323,6 +431,38 @@ def test_too_few_photographs(tmp_path: Path):
     ):
         with pytest.raises(UserError, match=error):
             photograph_files(images)
+
+
+@pytest.mark.parametrize("names", [("a_mask.png", "b_mask.png"), ("a.png.png", "b.png.png"), ()])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_masks_of_other_names_are_told_and_not_passed_over(names: tuple[str, ...], mode: str, tmp_path: Path):
+    """Whether or not the photographs have alpha channels, which would do."""
+    (tmp_path / "masks").mkdir()
+    for name in names:
+        placed(drawn(), 20, 30).getchannel("A").save(tmp_path / "masks" / name)
+    files = [saved(placed(drawn(), 20, 30).convert(mode), tmp_path / name) for name in ("a.png", "b.png")]
+    with pytest.raises(UserError) as told:
+        read_photographs(files, tmp_path / "masks", remove_background=False, crop=True)
+    assert str(told.value) == (
+        f"{files[0]}: has no mask; looked for {tmp_path / 'masks' / 'a'}.png (or with another suffix), "
+        f"found {', '.join(names) or 'nothing'}"
+    )
+
+
+def test_a_photograph_that_lacks_a_mask_others_have_is_named(rembg, tmp_path: Path):
+    (tmp_path / "masks").mkdir()
+    placed(drawn(), 20, 30).getchannel("A").save(tmp_path / "masks" / "a.png")
+    a = saved(placed(drawn(), 20, 30).convert("RGB"), tmp_path / "a.png")
+    b = saved(placed(drawn(), 20, 30), tmp_path / "b.png")
+    c = saved(Image.new("RGB", (40, 40)), tmp_path / "c.png")
+    lacking = r"b\.png: has no mask; looked for .*masks/b\.png \(.*\), found a\.png; its alpha channel is taken"
+    with pytest.warns(UserWarning, match=lacking):
+        read = read_photographs([a, b], tmp_path / "masks", remove_background=False, crop=True)
+    assert [each.mask is None for each in read] == [False, True]
+    with pytest.raises(UserError, match=r"c\.png: has no mask; looked for .*masks/c\.png \(.*\), found a\.png$"):
+        read_photographs([a, c], tmp_path / "masks", remove_background=False, crop=True)
+    with pytest.warns(UserWarning, match="c.png: has no mask; .*; its whole picture is taken"):
+        read_photographs([a, c], tmp_path / "masks", remove_background=False, crop=False)
 
 
 def test_masks_are_found_by_name(tmp_path: Path):
@@ -420,7 +560,8 @@ def test_masks_are_not_made_where_there_are_any(rembg, tmp_path: Path):
     plain = saved(placed(drawn(), 20, 30).convert("RGB"), tmp_path / "b.png")
     (tmp_path / "masks").mkdir()
     saved(placed(drawn(), 20, 30).getchannel("A"), tmp_path / "masks" / "b.png")
-    read = read_photographs([cut, plain], tmp_path / "masks", remove_background=True, crop=True)
+    with pytest.warns(UserWarning, match=r"a\.png: has no mask; .*; its alpha channel is taken"):
+        read = read_photographs([cut, plain], tmp_path / "masks", remove_background=True, crop=True)
     assert [each.made for each in read] == [False, False] and rembg.sessions == []
 
 

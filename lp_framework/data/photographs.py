@@ -1,8 +1,9 @@
 """Photographs of one object, prepared as the priors and models know views: upright, cut out, centred, square, on white.
 
-Where the object is, an image's own alpha channel says, a mask file, or `data.masks`. The crop is that of Zero123's demo
-(`load_and_preprocess`): the longest side of the object's bounding box becomes 200 of the image's 256 pixels, its centre
-the image's. Background is what is less than half opaque, as in the code of iFusion and ID-Pose.
+Where the object is, a mask file says, an image's own alpha channel, or a mask that is made (see `data.masks`). The crop
+is that of Zero123's demo (`load_and_preprocess`): the longest side of the object's bounding box becomes 200 of the
+image's 256 pixels, its centre the image's. Background is what is less than half opaque, as in the code of iFusion and
+ID-Pose.
 
 The prepared image is, nearly, that of a *virtual* camera with the field of view of the priors at the same viewpoint,
 turned to the object's centre and moved until the object fills that share of the frame. So latitude and longitude are
@@ -13,6 +14,8 @@ from __future__ import annotations
 
 import logging
 import math
+import mimetypes
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,26 +27,34 @@ from PIL import Image, ImageOps
 
 from lp_framework.atomic import written
 from lp_framework.data.files import expecting
-from lp_framework.data.masks import mask_maker
+from lp_framework.data.masks import HALF, alpha_opacity, mask_maker, mask_opacity, without_strays
 from lp_framework.errors import UserError
 
 log = logging.getLogger(__name__)
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
-HALF = 128  # opacity, of 255, from which on a pixel is the object's
 SMALLEST = 16  # pixels; a smaller object in a photograph says too little
 CUT_OFF = 0.1  # of the object's longest side: along the border, so much of it is no touch but a cut
-SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+SUFFIXES = (
+    ".bmp", ".gif", ".jfif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp",
+    ".avif",
+)  # fmt: skip
+EMPTY = "its mask is empty, nothing in it is at least half opaque"
+SHOWN = 5  # names of files in a sentence
 
 
 def photograph_files(images: str | Path | Sequence[str | Path]) -> list[Path]:
-    """The image files of a folder, sorted by name, or those of a list, as given; at least two, or a `UserError`."""
+    """The image files of a folder, sorted by name, or those of a list, as given; at least two, or a `UserError`. Warns
+    of files in the folder that are not read and may be photographs."""
     if isinstance(images, str | Path):
         folder = Path(images)
         if not folder.is_dir():
             what = "is one image, two or more are needed" if folder.exists() else "there is no such folder"
             raise UserError(f"images={folder}: {what}; give a list, images=[A.png,B.png], or a folder")
         files = _images_in(folder)
+        if left_out := [file.name for file in sorted(folder.iterdir()) if file not in files and _may_show(file)]:
+            hint = "save photographs as PNG or JPEG"
+            warnings.warn(f"images={folder}: files that are not read: {_listed(left_out)}; {hint}", stacklevel=2)
     else:
         files = [Path(str(image)) for image in images]
     if len(files) < 2:
@@ -53,7 +64,8 @@ def photograph_files(images: str | Path | Sequence[str | Path]) -> list[Path]:
 
 
 def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
-    """For every image its mask, the image of the same name in `folder` (with any suffix); None where there is none."""
+    """For every image its mask, the image of the same name in `folder` (with any suffix); None where there is none.
+    `UserError` where no image has one."""
     folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"masks={folder}: there is no such folder")
@@ -63,11 +75,32 @@ def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
             both = f"{first[file.stem]} and {file}"
             raise UserError(f"{both} have the same name, so {folder} cannot tell their masks apart")
     masks = {mask.stem: mask for mask in reversed(_images_in(folder))}
-    return [masks.get(file.stem) for file in files]
+    found = [masks.get(file.stem) for file in files]
+    if not any(found):
+        raise UserError(_no_mask(files[0], folder))
+    return found
+
+
+def _no_mask(file: Path, folder: str | Path) -> str:
+    """What was looked for and found where an image has no mask in `folder`."""
+    names = [found.name for found in sorted(Path(folder).iterdir()) if found.name[0] != "."]
+    there = _listed(names) or "nothing"
+    return f"{file}: has no mask; looked for {Path(folder) / file.stem}.png (or with another suffix), found {there}"
 
 
 def _images_in(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != ".")
+
+
+def _may_show(file: Path) -> bool:
+    """Whether a file that is not read may be a photograph: it is not known as text or as anything else."""
+    kind = mimetypes.guess_type(file.name)[0] or "unknown"
+    return file.is_file() and file.name[0] != "." and kind.partition("/")[0] in ("unknown", "image", "video")
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
 
 
 @contextmanager
@@ -75,6 +108,15 @@ def opened(file: str | Path) -> Iterator[Image.Image]:
     """An image file, of which only the head has been read; `UserError` naming the file where it cannot be read."""
     with expecting(f"{file}: is not a readable image"), Image.open(file) as image:
         yield image
+
+
+def read_mask(file: str | Path) -> Image.Image:
+    """A mask file with its own levels, turned as its EXIF orientation says (see `masks.mask_opacity`); `UserError`
+    naming the file where it cannot be read."""
+    with opened(file) as mask:
+        turned = ImageOps.exif_transpose(mask)
+        turned.load()
+        return turned
 
 
 def read_image(file: str | Path) -> Image.Image:
@@ -125,15 +167,13 @@ def cut_out(
         if mask.size != image.size:
             sides = f"{image.width} x {image.height} pixels but its mask is {mask.width} x {mask.height}"
             raise UserError(f"{name}: is {sides}")
-        # What is opaque in a mask with transparency, what is bright in any other.
-        opacity = _opacity(mask.getchannel("A")) if mask.mode == "RGBA" else None
-        opacity = opacity or _opacity(mask.convert("L"))
+        opacity = mask_opacity(mask, name)
         if opacity is None:
             raise UserError(f"{name}: its mask marks no background, which must be black")
     elif image.mode == "RGBA":
-        opacity = _opacity(image.getchannel("A"))
+        opacity = alpha_opacity(image.getchannel("A"))
     if opacity is None and remove_background:
-        opacity = _opacity(made_mask(image, name))
+        opacity = alpha_opacity(made_mask(image, name))
     if opacity is None and required:
         raise UserError(
             f"{name}: has no transparent background (alpha channel) and no mask; give masks=FOLDER or "
@@ -148,33 +188,25 @@ def made_mask(image: Image.Image, name: str) -> Image.Image:
     """A mask ("L") of an image's object, see `data.masks`; `UserError` where no background is found."""
     maker = mask_maker()
     mask = maker.mask(image.convert("RGB"))
-    if _opacity(mask) is None:
+    if alpha_opacity(mask) is None:
         raise UserError(f"{name}: {maker.name} finds no background in it; give a mask")
     return mask
 
 
-def _opacity(levels: Image.Image) -> Image.Image | None:
-    """The opacity that an alpha channel or mask ("L") stands for; None where nothing is less than half opaque."""
-    values = np.asarray(levels)
-    low, high = int(values.min()), int(values.max())
-    if low >= HALF:
-        return None
-    # The least level is background, 127 in ID-Pose's cut-outs; of just two the other one is opaque, be it 1.
-    top = high if low < high and ((values == low) | (values == high)).all() else 255
-    stretched = (values.astype(np.float32) - low) * (255 / (top - low))
-    return Image.fromarray(np.rint(stretched).astype(np.uint8))
-
-
 def crop_to_object(image: Image.Image, name: str) -> Image.Image:
-    """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module)."""
-    box = image.getchannel("A").point([0] * HALF + [255] * (256 - HALF)).getbbox()
+    """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module);
+    stray parts far from the object are left out."""
+    opacity = without_strays(image.getchannel("A"), name)
+    opaque = np.asarray(opacity) >= HALF
+    box = Image.fromarray(opaque).getbbox()
     if box is None:
-        raise UserError(f"{name}: its mask is empty, nothing in it is at least half opaque")
+        most = int(np.asarray(opacity).max())
+        empty = f"nothing in its mask is at least half opaque, at most {most / 255:.0%}" if most else EMPTY
+        raise UserError(f"{name}: {empty}")
     left, top, right, bottom = box
     longest = max(right - left, bottom - top)
     if longest < SMALLEST:
         raise UserError(f"{name}: the object is {longest} pixels long, at least {SMALLEST} are needed")
-    opaque = np.asarray(image.getchannel("A")) >= HALF
     if max(int(line.sum()) for line in (opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1])) > CUT_OFF * longest:
         log.warning(
             "%s: the image's border seems to cut the object off; an answer wants all of it in the picture", name
@@ -183,6 +215,8 @@ def crop_to_object(image: Image.Image, name: str) -> Image.Image:
     corners = np.array([left + right - side, top + bottom - side, left + right + side, top + bottom + side]) / 2
     whole = (*(math.floor(corner) for corner in corners[:2]), *(math.ceil(corner) for corner in corners[2:]))
     x0, y0, x1, y1 = (corners - np.tile(whole[:2], 2)).tolist()
+    image = image.copy()
+    image.putalpha(opacity)
     return image.crop(whole).resize((SIZE, SIZE), Image.Resampling.LANCZOS, box=(x0, y0, x1, y1))
 
 
@@ -216,24 +250,24 @@ def read_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
 ) -> list[Photograph]:
     """Image files with their masks from the folder `masks`, or, with `remove_background`, made for those that have
-    neither mask nor alpha channel; all are read before that begins."""
+    neither mask nor alpha channel; all images are read before that begins."""
     for name, value in (("remove_background", remove_background), ("crop", crop)):
         if not isinstance(value, bool):
             raise UserError(f"{name} must be true or false, got {value}")
     found = mask_files(files, masks) if masks is not None else [None] * len(files)
     images = [read_image(file) for file in files]
-    read = [
-        Photograph(str(file), image, None if mask is None else read_image(mask), False)
-        for file, image, mask in zip(files, images, found, strict=True)
-    ]
-    if not remove_background:
-        return read
-    return [
-        each._replace(mask=made_mask(each.image, each.name), made=True)
-        if each.mask is None and (each.image.mode != "RGBA" or _opacity(each.image.getchannel("A")) is None)
-        else each
-        for each in read
-    ]
+    given = [None if mask is None else read_mask(mask) for mask in found]
+    read = []
+    for file, image, mask in zip(files, images, given, strict=True):
+        marked = image.mode == "RGBA" and alpha_opacity(image.getchannel("A")) is not None
+        if masks is not None and mask is None:
+            if crop and not marked and not remove_background:
+                raise UserError(_no_mask(file, masks))
+            instead = "alpha channel" if marked else "made mask" if remove_background else "whole picture"
+            warnings.warn(f"{_no_mask(file, masks)}; its {instead} is taken", stacklevel=2)
+        made = remove_background and mask is None and not marked
+        read.append(Photograph(str(file), image, made_mask(image, str(file)) if made else mask, made))
+    return read
 
 
 def prepared_photographs(

@@ -29,7 +29,8 @@ from scipy.ndimage import binary_erosion
 from torch import Tensor
 
 from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below, numbers, read_json
-from lp_framework.data.photographs import HALF, read_image
+from lp_framework.data.masks import HALF
+from lp_framework.data.photographs import read_image
 from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes, from_pytorch3d, ndc_intrinsics
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
@@ -180,7 +181,7 @@ def read_points(file: Path) -> Tensor:
 
 def mask_pixels(photograph: Photograph) -> NDArray[np.float64]:
     """Centres `[M, 2]` (x, y; pixels) of the outermost object pixels in each row and column of a photograph's mask."""
-    inside = np.asarray(photograph.read(photograph.mask, "L")) >= HALF
+    inside = np.asarray(photograph.opacity()) >= HALF
     outline = inside & ~binary_erosion(inside)
     rows, columns = np.nonzero(outline)
     chosen = np.linspace(0, len(rows) - 1, min(len(rows), SAMPLES)).round().astype(int)

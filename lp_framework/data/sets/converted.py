@@ -30,7 +30,8 @@ from torch import Tensor
 from lp_framework.data import real_cameras
 from lp_framework.data.cache import tracked
 from lp_framework.data.files import LIST, differences, locked, raise_failures, read_record, written_folder
-from lp_framework.data.photographs import HALF, read_image
+from lp_framework.data.masks import HALF, mask_opacity
+from lp_framework.data.photographs import read_image, read_mask
 from lp_framework.data.views import ViewSource, write_transforms
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import is_rotation, to_ifusion, view_pose
@@ -58,9 +59,16 @@ class Photograph:
         if not (self.intrinsics.diagonal()[:2] > 0).all():
             raise ValueError("its focal lengths must be positive")
 
-    def read(self, file: Path, mode: str) -> Image.Image:
-        """The photograph or its mask; `UserError` where it cannot be read and where its size is another."""
-        image = read_image(file).convert(mode)
+    def colours(self) -> Image.Image:
+        """The photograph in RGB; `UserError` where it cannot be read and where its size is another."""
+        return self._of_size(self.file, read_image(self.file)).convert("RGB")
+
+    def opacity(self) -> Image.Image:
+        """What its mask marks ("L"), all of it where that has no background; `UserError` as those of `colours`."""
+        mask = self._of_size(self.mask, read_mask(self.mask))
+        return mask_opacity(mask, str(self.file)) or Image.new("L", self.size, 255)
+
+    def _of_size(self, file: Path, image: Image.Image) -> Image.Image:
         if image.size != self.size:
             (width, height), (wide, high) = image.size, self.size
             raise UserError(f"{file}: is {width} x {height} pixels, the photograph should be {wide} x {high}")
@@ -251,8 +259,8 @@ def crop(view: SphericalView, size: int) -> Image.Image:
     """The object-centric crop of a photograph, RGBA of `size` pixels a side, transparent where the mask is dark and
     beyond the photograph."""
     photograph = view.photograph
-    cut = photograph.read(photograph.file, "RGB")
-    cut.putalpha(photograph.read(photograph.mask, "L"))
+    cut = photograph.colours()
+    cut.putalpha(photograph.opacity())
     homography = real_cameras.crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
     # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing.
     larger = max(1, math.ceil(_magnification(homography, size) - 0.05))
