@@ -1,6 +1,7 @@
 import json
 import math
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 
 from lp_framework import registry
 from lp_framework.data.sets.converted import Photograph, SphericalView, crop, sound_views, spread
-from lp_framework.data.sets.hopev2 import HOPEv2Data
+from lp_framework.data.sets.hopev2 import ANNOTATIONS, HOPEv2Data
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, view_pose
@@ -102,6 +103,82 @@ def test_images_may_be_jpegs_of_an_onboarding_sequence(make, root):
     write_scene(root / "onboarding_static" / "obj_000001_up", real_cameras(8, seed=4), suffix=".jpg")
     with pytest.warns(UserWarning):
         make(train_views=12).prepare()  # more than there are in `val`
+
+
+def scaled(factor: float, *keys: str):
+    """A change to annotations: lengths of these keys, or all of a model, in another unit."""
+
+    def change(content: dict) -> None:
+        for entries in content.values():
+            for entry in entries if isinstance(entries, list) else [entries]:
+                for key in keys or list(entry):
+                    value = entry[key]
+                    entry[key] = [factor * each for each in value] if isinstance(value, list) else factor * value
+
+    return change
+
+
+@pytest.mark.filterwarnings("ignore:.*are left out")
+@pytest.mark.parametrize(
+    ("model", "pose", "units"),
+    [
+        (0.001, 0.001, "models and cam_t_m2c in the same unit"),
+        (0.001, 1.0, "models in metres, cam_t_m2c in millimetres"),
+        (1.0, 0.001, "models in millimetres, cam_t_m2c in metres"),
+    ],
+)
+def test_metres_are_told_from_millimetres_by_the_masks(make, root, tmp_path, model, pose, units):
+    rewrite(root / "models" / "models_info.json", scaled(model))
+    for folder in root.glob("val*/*"):
+        rewrite(folder / "scene_gt.json", scaled(pose, "cam_t_m2c"))
+    with warnings.catch_warnings(record=True) as told:
+        make().prepare()
+    taken = [str(each.message) for each in told if "taken are" in str(each.message)]
+    expected = [f"{root}: object 'obj_000001': taken are {units}, as its masks show"] if model != pose else []
+    assert taken == expected
+    assert json.loads((tmp_path / "views/obj_000001/conversion.json").read_text())["units"] == units
+    for split, count in (("train", 5), ("test", 3)):
+        frames = json.loads((tmp_path / "views" / "obj_000001" / split / "transform.json").read_text())["frames"]
+        for frame in frames:
+            recorded = torch.tensor(frame["photograph_camera"], dtype=torch.float64)
+            true, _ = real_cameras(9)[int(Path(frame["source"]).stem) // 3]
+            torch.testing.assert_close(recorded, true, rtol=0, atol=1e-9)
+        assert len(frames) == count
+
+
+@pytest.mark.parametrize("factor", [100.0, 0.1])
+def test_a_model_in_another_unit_is_refused(make, root, factor):
+    rewrite(root / "models" / "models_info.json", scaled(factor))
+    with pytest.raises(UserError, match=r"its masks show it .* times as long as its model is; .* or metres"):
+        make().prepare()
+
+
+@pytest.mark.filterwarnings("ignore:.*are left out")
+@pytest.mark.parametrize("files", [["scene_gt.json"], ["scene_camera.json", "scene_gt_info.json"], ANNOTATIONS])
+def test_numbers_of_images_may_be_padded_with_zeros(make, root, tmp_path, files):
+    for folder in root.glob("val*/*"):
+        for file in files:
+            content = json.loads((folder / file).read_text())
+            (folder / file).write_text(json.dumps({key.zfill(6): value for key, value in content.items()}))
+    info = root / "models" / "models_info.json"
+    info.write_text(json.dumps({"000001": json.loads(info.read_text())["1"]}))
+    data = make()
+    data.prepare()
+    assert data.names() == ["obj_000001"] and len(data.views("obj_000001", "train")) == 5
+    record = json.loads((tmp_path / "views" / "obj_000001" / "conversion.json").read_text())
+    assert record["left_out"] == {"occluded": 3}
+
+
+@pytest.mark.filterwarnings("ignore:.*are left out")
+@pytest.mark.parametrize("values", [np.uint8([0, 1]), np.uint16([0, 1]), np.uint16([0, 65535]), np.uint16([0, 255])])
+def test_masks_of_zeros_and_ones_or_of_16_bits_mark_the_same_pixels(make, root, tmp_path, values):
+    make().prepare()
+    for file in root.glob("val*/*/mask_visib/*.png"):
+        Image.fromarray(values[(np.asarray(Image.open(file)) > 0).astype(int)]).save(file)
+    make(views=str(tmp_path / "again")).prepare()
+    for file in (tmp_path / "views").rglob("*.png"):
+        again = tmp_path / "again" / file.relative_to(tmp_path / "views")
+        assert np.array_equal(np.asarray(Image.open(file)), np.asarray(Image.open(again)))
 
 
 def test_a_crop_that_shrinks_the_photograph_is_averaged_not_sampled(tmp_path):

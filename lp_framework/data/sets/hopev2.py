@@ -1,8 +1,8 @@
 """HOPEv2 (Tyree et al. 2022), or any data set in the BOP format, as object-centric views.
 
-    <path>/models/models_info.json                      bounding boxes of the objects, millimetres
+    <path>/models/models_info.json                      bounding boxes of the objects, millimetres (or metres)
     <path>/<split>/<scene>/scene_camera.json            cam_K of every image
-    <path>/<split>/<scene>/scene_gt.json                obj_id, cam_R_m2c, cam_t_m2c (millimetres) of every instance
+    <path>/<split>/<scene>/scene_gt.json                obj_id, cam_R_m2c, cam_t_m2c (millimetres, or metres)
     <path>/<split>/<scene>/scene_gt_info.json           visib_fract of every instance
     <path>/<split>/<scene>/rgb/000000.png               or .jpg
     <path>/<split>/<scene>/mask_visib/000000_000000.png of an instance, by image and place in scene_gt.json
@@ -13,17 +13,22 @@ their number, `obj_000001`, as their models are.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from lp_framework.data.files import ObjectLists, expecting, kept_lists, numbers, read_json
-from lp_framework.data.photographs import opened
+from lp_framework.data.masks import HALF, mask_opacity
+from lp_framework.data.photographs import opened, read_mask
 from lp_framework.data.real_cameras import ObjectFrame, z_up_to_y_up
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
@@ -31,6 +36,13 @@ from lp_framework.geometry import from_opencv, inverse, rigid_transform
 from lp_framework.registry import register
 
 ANNOTATIONS = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
+UNITS = {  # what takes cam_t_m2c to the unit of the models, and what that means
+    1.0: "models and cam_t_m2c in the same unit",
+    1000.0: "models in millimetres, cam_t_m2c in metres",
+    0.001: "models in metres, cam_t_m2c in millimetres",
+}
+SAMPLES = 9  # masks of an object that its unit is told from
+FARTHEST_OFF = 8.0  # times larger or smaller than its masks show: an object that is of neither unit
 
 
 class Instance(NamedTuple):
@@ -42,6 +54,16 @@ class Instance(NamedTuple):
     visible: float  # share of the silhouette
     pose: Any
     camera: Any
+
+    @property
+    def mask(self) -> Path:
+        return self.scene / "mask_visib" / f"{self.image:06d}_{self.place:06d}.png"
+
+    def numbers(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Rotation `[3, 3]` and translation `[3]`, from the model to the camera, and intrinsics `[3, 3]`."""
+        with expecting(f"{self.scene}: image {self.image} needs cam_K of 9 numbers, cam_R_m2c of 9 and cam_t_m2c of 3"):
+            rotation = numbers(self.pose["cam_R_m2c"], 9).view(3, 3)
+            return rotation, numbers(self.pose["cam_t_m2c"], 3), numbers(self.camera["cam_K"], 9).view(3, 3)
 
 
 @register("data", "hopev2")
@@ -80,10 +102,12 @@ class HOPEv2Data(PhotographedData):
         instances = self._instances.get(number, [])
         visible = [each for each in instances if each.visible >= self.least_visible]
         hidden = Counter({"occluded": len(instances) - len(visible)})
-        return Annotated([_photograph(each, frame) for each in visible], frame.corners(), +hidden, {})
+        unit = _unit(visible, frame, f"{self.download}: object '{name}'")
+        photographs = [_photograph(each, frame, unit) for each in visible]
+        return Annotated(photographs, frame.corners(), +hidden, {"units": UNITS[unit]})
 
     def _frames(self) -> dict[int, ObjectFrame]:
-        """The objects' frames in those of their models, by number; millimetres."""
+        """The objects' frames in those of their models, by number; in their unit."""
         file = self.download / "models" / "models_info.json"
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
             frames = {int(number): _frame(info) for number, info in read_json(file).items()}
@@ -101,13 +125,14 @@ class HOPEv2Data(PhotographedData):
             raise UserError(f"{self.download}: has no annotated scenes; looked for {looked}")
         found: dict[int, list[Instance]] = {}
         for scene in scenes:
-            cameras, poses, infos = (read_json(scene / file) for file in ANNOTATIONS)
+            contents = [read_json(scene / file) for file in ANNOTATIONS]
             wanted = "need cameras, and obj_id and visib_fract of the same instances"
             with expecting(f"{scene}: {', '.join(ANNOTATIONS)} {wanted}"):
+                cameras, poses, infos = (_by_number(content) for content in contents)
                 for image, entries in poses.items():
                     for place, (pose, info) in enumerate(zip(entries, infos[image], strict=True)):
                         found.setdefault(int(pose["obj_id"]), []).append(
-                            Instance(scene, int(image), place, float(info["visib_fract"]), pose, cameras.get(image))
+                            Instance(scene, image, place, float(info["visib_fract"]), pose, cameras.get(image))
                         )
         return found
 
@@ -118,18 +143,45 @@ def _frame(info: dict[str, Any]) -> ObjectFrame:
     return ObjectFrame(axes, low + sides / 2, longest, axes @ sides / longest)
 
 
-def _photograph(instance: Instance, frame: ObjectFrame) -> Photograph:
+def _by_number(content: Mapping[str, Any]) -> dict[int, Any]:
+    """Annotations by the number of their image, which some pad with zeros."""
+    return {int(image): entry for image, entry in content.items()}
+
+
+def _unit(instances: Sequence[Instance], frame: ObjectFrame, name: str) -> float:
+    """The key of `UNITS` by which an object is about as long as its masks show it; a warning where that is not 1."""
+    times = []  # what the masks show, in longest sides, by each unit
+    for instance in instances[:: math.ceil(len(instances) / SAMPLES) or 1]:
+        rotation, translation, intrinsics = instance.numbers()
+        opacity = mask_opacity(read_mask(instance.mask), str(instance.mask))
+        rows, columns = np.nonzero(np.asarray(opacity) >= HALF) if opacity else ((), ())
+        if len(rows) and intrinsics[0, 0] > 0:
+            shown = (max(np.ptp(rows), np.ptp(columns)) + 1) / intrinsics[0, 0]
+            distances = torch.stack([(rotation @ frame.centre + unit * translation).norm() for unit in UNITS])
+            times.append(shown * distances / frame.longest_side)
+    if not times:
+        return 1.0
+    median = torch.stack(times).median(dim=0).values
+    best = int(median.log().abs().argmin())
+    if not 1 / FARTHEST_OFF <= median[best] <= FARTHEST_OFF:
+        wanted = "models_info.json and cam_t_m2c must be in millimetres or metres"
+        raise UserError(f"{name}: its masks show it {median[0]:.3g} times as long as its model is; {wanted}")
+    unit = list(UNITS)[best]
+    if unit != 1:
+        warnings.warn(f"{name}: taken are {UNITS[unit]}, as its masks show", stacklevel=2)
+    return unit
+
+
+def _photograph(instance: Instance, frame: ObjectFrame, unit: float) -> Photograph:
     scene, image = instance.scene, instance.image
     files = [scene / "rgb" / f"{image:06d}{suffix}" for suffix in (".png", ".jpg")]
     file = next((file for file in files if file.is_file()), files[0])
-    mask = scene / "mask_visib" / f"{image:06d}_{instance.place:06d}.png"
     with opened(file) as photograph:
         size = photograph.size
-    with expecting(f"{scene}: image {image} needs cam_K of 9 numbers, cam_R_m2c of 9 and cam_t_m2c of 3"):
-        rotation, translation = instance.pose["cam_R_m2c"], instance.pose["cam_t_m2c"]
-        pose = rigid_transform(numbers(rotation, 9).view(3, 3), numbers(translation, 3))
-        intrinsics = numbers(instance.camera["cam_K"], 9).view(3, 3)
+    rotation, translation, intrinsics = instance.numbers()
+    with expecting(f"{scene}: image {image} has a camera that cannot be"):
+        pose = rigid_transform(rotation, unit * translation)
         if (pose[:3, :3] @ frame.centre + pose[:3, 3])[2] <= 0:
             raise ValueError("the object is behind its camera")
         half = intrinsics.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        return Photograph(file, mask, frame.camera(from_opencv(inverse(pose))), intrinsics + half, size)
+        return Photograph(file, instance.mask, frame.camera(from_opencv(inverse(pose))), intrinsics + half, size)
