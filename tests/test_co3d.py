@@ -1,6 +1,7 @@
 import gzip
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from co3d_layout import (
     box_points,
     in_world,
     orbit,
+    viewpoint,
     write_category,
     write_frames,
     write_sequences,
@@ -25,12 +27,19 @@ from painted_cube import SIDES, photograph
 from PIL import Image
 
 from lp_framework import registry
-from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes
+from lp_framework.data.real_cameras import agreeing_views, fitting_views, frame_of_points, frame_of_silhouettes
 from lp_framework.data.sets.co3d import CO3DData, mask_pixels, read_points
 from lp_framework.data.sets.converted import Photograph
 from lp_framework.data.views import read_views
 from lp_framework.errors import UserError
-from lp_framework.geometry import camera_to_world, geodesic_angle, view_pose
+from lp_framework.geometry import (
+    camera_to_world,
+    geodesic_angle,
+    rigid_transform,
+    so3_exp,
+    view_pose,
+    wrap_angle,
+)
 
 
 def read_frames(root: Path) -> list:
@@ -96,17 +105,64 @@ def test_the_frame_is_found_better_from_a_point_cloud_in_spite_of_stray_points(s
     assert sorted(along.argmax(dim=1).tolist()) == [0, 1, 2] and (along.amax(dim=1) > 0.999).all()
     sides = torch.tensor(SIDES, dtype=torch.float64)[along.argmax(dim=1)]
     torch.testing.assert_close(frame.sides, sides, rtol=0, atol=0.03)
-    assert frame.agrees(frame_of_silhouettes(cameras, intrinsics, pixels))
+    assert fitting_views(cameras, intrinsics, pixels, box_points()).all()
 
 
-def test_a_cloud_of_something_else_does_not_agree_with_the_silhouettes(seen_cameras):
+def test_a_cloud_of_something_else_fits_no_silhouettes(seen_cameras):
     cameras, intrinsics, pixels = seen_cameras
-    silhouettes = frame_of_silhouettes(cameras, intrinsics, pixels)
     points = box_points()
     for others in (points + 0.5 * SCALE, (points - ORIGIN) * 2 + ORIGIN, (points - ORIGIN) / 2 + ORIGIN):
-        assert not frame_of_points(cameras, others).agrees(silhouettes)
+        assert fitting_views(cameras, intrinsics, pixels, others).double().mean() < 0.2
     with pytest.raises(ValueError, match="its point cloud has no extent"):
         frame_of_points(cameras, points[:1].expand(9, 3))
+
+
+def wrong_cameras(camera: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Cameras that reconstructions give where they fail; `camera` is the right one, in the world."""
+    random = so3_exp(torch.tensor([0.4, 1.9, -0.8], dtype=torch.float64))
+    about = so3_exp(torch.tensor([0.1, -0.5, 0.2], dtype=torch.float64))
+    far = ORIGIN + 6 * (camera[:3, 3] - ORIGIN)
+    return {
+        "turned": rigid_transform(random @ camera[:3, :3], camera[:3, 3]),
+        "turned a little": rigid_transform(about @ camera[:3, :3], camera[:3, 3]),
+        "turned away": rigid_transform(camera[:3, :3] * torch.tensor([-1.0, 1.0, -1.0]), camera[:3, 3]),
+        "elsewhere": rigid_transform(camera[:3, :3], camera[:3, 3] + 3 * SCALE * random[0]),
+        "of another world": rigid_transform(random, 50 * SCALE * random[1]),
+        "far away": rigid_transform(camera[:3, :3], far),
+        "among the points": rigid_transform(camera[:3, :3], ORIGIN + 0.2 * SCALE * random[2]),
+    }
+
+
+WRONG = tuple(wrong_cameras(torch.eye(4, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_wrong_camera_is_told_by_the_cloud_and_by_the_others(seen_cameras, kind):
+    cameras, intrinsics, pixels = seen_cameras
+    for index in (0, 7, 23):
+        damaged = cameras.clone()
+        damaged[index] = wrong_cameras(cameras[index])[kind]
+        expected = [number != index for number in range(24)]
+        assert fitting_views(damaged, intrinsics, pixels, box_points()).tolist() == expected
+        assert agreeing_views(damaged, intrinsics, pixels).tolist() == expected
+
+
+def test_several_wrong_cameras_are_told_among_few(seen_cameras):
+    cameras, intrinsics, pixels = (each[::3] for each in seen_cameras)
+    damaged = cameras.clone()
+    for index, kind in ((1, "turned"), (4, "elsewhere"), (6, "turned a little")):
+        damaged[index] = wrong_cameras(cameras[index])[kind]
+    expected = [index not in (1, 4, 6) for index in range(8)]
+    assert fitting_views(damaged, intrinsics, pixels, box_points()).tolist() == expected
+    assert agreeing_views(damaged, intrinsics, pixels).tolist() == expected
+
+
+def test_a_camera_that_is_turned_on_its_side_does_not_move_up(seen_cameras):
+    cameras = seen_cameras[0].clone()
+    for degrees in (45, 90):
+        roll = so3_exp(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
+        cameras[5, :3, :3] = seen_cameras[0][5, :3, :3] @ roll
+        assert math.degrees(torch.acos(frame_of_points(cameras, box_points()).axes[1] @ WORLD[:, 1])) < 1.5
 
 
 def test_cameras_on_a_vertical_arc_do_not_tell_up(tmp_path):
@@ -158,6 +214,32 @@ def test_views_keep_the_true_relative_poses_but_for_up_and_scale(root, tmp_path,
     record = json.loads((tmp_path / "views" / data.names()[0] / "conversion.json").read_text())
     assert record["object_frame"] == ("point cloud" if cloud else "silhouettes")
     assert record["viewpoint_quality_score"] == 2.5 and record["point_cloud_quality_score"] == 1.7
+
+
+@pytest.mark.parametrize("cloud", [True, False])
+@pytest.mark.parametrize("kind", ["turned", "elsewhere", "far away"])
+def test_one_wrong_camera_is_left_out_by_name_and_changes_no_other_view(make, root, tmp_path, kind, cloud):
+    if not cloud:
+        (root / CLOUD).unlink()
+    right = make(views=str(tmp_path / "right"), train_views=9, test_views=4).photographs(f"hydrant-{SEQUENCE}")
+    frames = read_frames(root)
+    camera, intrinsics = orbit(14)[8]
+    frames[8]["viewpoint"] = viewpoint(wrong_cameras(in_world(camera))[kind], intrinsics, isotropic=True)
+    write_frames(root, frames)
+    data = make(train_views=9, test_views=4)
+    reason = "whose camera or mask does not fit the others' (frame000009.jpg)"
+    with pytest.warns(UserWarning, match=re.escape(f"object 'hydrant-{SEQUENCE}': 1 {reason} are left out")):
+        data.prepare()
+    record = json.loads((tmp_path / "views" / f"hydrant-{SEQUENCE}" / "conversion.json").read_text())
+    assert record["object_frame"] == ("point cloud" if cloud else "silhouettes") and record["left_out"] == {reason: 1}
+    poses = {each.file.name: view_pose(each.camera) for each in right.photographs}
+    found = {each.file.name: view_pose(each.camera) for each in data.photographs(f"hydrant-{SEQUENCE}").photographs}
+    assert poses.keys() - found.keys() == {"frame000009.jpg"}
+    latitude, longitude, distance = torch.stack([found[name] - poses[name] for name in found]).unbind(-1)
+    # Which way is forward is free, and up is that of fewer cameras.
+    assert latitude.abs().max() < math.radians(1) and wrap_angle(longitude - longitude[0]).abs().max() < math.radians(2)
+    distances = torch.stack([poses[name][2] for name in found])
+    assert (distance / distances).abs().max() < (0.01 if cloud else 0.05)
 
 
 def test_sequences_without_scores_or_a_cloud(make, root, tmp_path):

@@ -14,6 +14,7 @@ corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). It sta
 
 Where there is no model of the object, up is the direction to which the cameras' right axes are closest to
 perpendicular: photographers hold cameras level. Its silhouettes or its point cloud tell its centre and longest side.
+Among many cameras a few may be wrong: `fitting_views` and `agreeing_views` tell which.
 """
 
 from __future__ import annotations
@@ -32,7 +33,12 @@ from lp_framework.geometry import camera_to_world, geodesic_angle, inverse, rigi
 NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
 STRAY = 0.01  # share of a cloud's points beyond either side of its box: reconstructions have stray points
 POINTS = 20_000  # of a cloud that its box is taken from
-FARTHEST_APART, MOST_LARGER = 0.25, 1.5  # of longest sides, for the centres, and times, for the sides: see `agrees`
+PROJECTED = 2_000  # of a cloud that its box in a photograph is taken from
+LEAST_OVERLAP = 0.5  # of the boxes of a silhouette and a cloud in a photograph: intersection over union
+CANDIDATES = 2_000  # pairs of views whose lines of sight propose an object's centre
+FARTHEST_APART = 0.25  # of a silhouette's longest side, from its middle to where the centre is seen
+MOST_LARGER = 3.0  # times, of a silhouette's length at the centre's distance, against the median one
+LEVEL = math.sin(math.radians(5))  # of a right axis along up; a camera that is less level weighs less
 
 
 def from_pytorch3d(rotation: Tensor, translation: Tensor) -> Tensor:
@@ -171,11 +177,50 @@ class ObjectFrame(NamedTuple):
         """Corners `[8, 3]` of its bounding box, in the frame."""
         return torch.cartesian_prod(*(torch.stack([-side, side]) / 2 for side in self.sides))
 
-    def agrees(self, other: ObjectFrame) -> bool:
-        """Whether another account of the object has about the same centre and longest side."""
-        apart = (self.centre - other.centre).norm() / other.longest_side
-        larger = self.longest_side / other.longest_side
-        return bool(apart <= FARTHEST_APART and 1 / MOST_LARGER <= larger <= MOST_LARGER)
+
+def fitting_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.float64]], points: Tensor) -> Tensor:
+    """Which views `[V]` (bool) have the points `[P, 3]` on an object's surface where its silhouette is; the other
+    arguments are those of `frame_of_silhouettes`."""
+    points = _some(points, PROJECTED)
+    stray = torch.tensor([STRAY, 1 - STRAY]).to(points)
+    cloud = torch.stack([torch.quantile(seen, stray, dim=0) for seen in project(cameras, intrinsics, points)])
+    shown = _boxes(pixels)
+    common = torch.minimum(cloud[:, 1], shown[:, 1]) - torch.maximum(cloud[:, 0], shown[:, 0])
+    intersection = common.clamp(min=0).prod(dim=-1)
+    areas = (cloud[:, 1] - cloud[:, 0]).prod(dim=-1) + (shown[:, 1] - shown[:, 0]).prod(dim=-1)
+    return intersection >= LEAST_OVERLAP * (areas - intersection)  # false where NaN: points behind the camera
+
+
+def agreeing_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.float64]]) -> Tensor:
+    """Which views `[V]` (bool) have one point near the middle of their silhouettes, and see these about equally long;
+    the arguments are those of `frame_of_silhouettes`.
+
+    Each pair of lines of sight through the middles proposes the point nearest to both; taken is the one that most views
+    agree on.
+    """
+    boxes = _boxes(pixels)
+    middles, lengths = boxes.mean(dim=1), (boxes[:, 1] - boxes[:, 0]).amax(dim=-1)
+    seen = torch.linalg.solve(intrinsics, torch.cat([middles, torch.ones_like(middles[:, :1])], dim=-1))
+    rays = (cameras[:, :3, :3] @ (seen * seen.new_tensor([1.0, -1.0, -1.0]))[..., None]).squeeze(-1)
+    pairs = _some(torch.combinations(torch.arange(len(cameras))), CANDIDATES)
+    points = _nearest_point(cameras[pairs, :3, 3], rays[pairs])
+    offsets = (project(cameras, intrinsics, points) - middles[:, None]).norm(dim=-1)  # [V, P]
+    agreed = offsets <= FARTHEST_APART * lengths[:, None]
+    best = int(agreed.sum(dim=0).argmax())
+    distances = (cameras[:, :3, 3] - points[best]).norm(dim=-1)
+    sizes = lengths * distances / intrinsics[:, 0, 0]
+    larger = sizes / sizes[agreed[:, best]].median()
+    return agreed[:, best] & (larger <= MOST_LARGER) & (larger >= 1 / MOST_LARGER)
+
+
+def _boxes(pixels: list[NDArray[np.float64]]) -> Tensor:
+    """Least and largest pixels `[V, 2, 2]` of silhouettes."""
+    return torch.from_numpy(np.stack([np.stack([each.min(axis=0), each.max(axis=0)]) for each in pixels]))
+
+
+def _some(rows: Tensor, count: int) -> Tensor:
+    """At most `count` rows, evenly from first to last."""
+    return rows[torch.linspace(0, len(rows) - 1, min(len(rows), count)).round().long()]
 
 
 def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.float64]]) -> ObjectFrame:
@@ -212,7 +257,7 @@ def frame_of_points(cameras: Tensor, points: Tensor) -> ObjectFrame:
     each side. Raises `ValueError` where the cameras do not go round the object and where the points have no extent.
     """
     axes = _axes(cameras)
-    points = points[torch.linspace(0, len(points) - 1, min(len(points), POINTS)).round().long()]
+    points = _some(points, POINTS)
     turns = [_about_up(math.radians(degrees)) @ axes for degrees in range(90)]
     boxes = [torch.quantile(points @ turned.mT, torch.tensor([STRAY, 1 - STRAY]).to(axes), dim=0) for turned in turns]
     sides = torch.stack([high - low for low, high in boxes])  # [90, 3]
@@ -226,8 +271,11 @@ def frame_of_points(cameras: Tensor, points: Tensor) -> ObjectFrame:
 def _axes(cameras: Tensor) -> Tensor:
     """Rows `[3, 3]` of axes of the world the second of which is up; the horizontal ones are any."""
     right, up = cameras[:, :3, 0], cameras[:, :3, 1]
-    spread, directions = torch.linalg.eigh(right.mT @ right / len(right))
-    axis = directions[:, 0]
+    weights = torch.ones_like(right[:, :1])
+    for _ in range(10):  # least squares for nearly level cameras, least absolute values for others
+        spread, directions = torch.linalg.eigh(right.mT @ (weights * right) / weights.sum())
+        axis = directions[:, 0]
+        weights = LEVEL / (right @ axis[:, None]).abs().clamp(min=LEVEL)
     if spread[1] < 0.02:
         raise ValueError("its cameras do not go round the object, so which way is up cannot be told")
     axis = axis * torch.where((up @ axis).mean() < 0, -1.0, 1.0)
@@ -249,7 +297,9 @@ def _rays(rotation: Tensor, intrinsics: Tensor, pixels: NDArray[np.float64]) -> 
 
 
 def _nearest_point(places: Tensor, directions: Tensor) -> Tensor:
-    """The point `[3]` with the least sum of squared distances from lines through `[V, 3]` along `[V, 3]`."""
+    """The point `[..., 3]` with the least sum of squared distances from lines through `[..., V, 3]` along
+    `[..., V, 3]`; one of them where there are many."""
     unit = torch.nn.functional.normalize(directions, dim=-1)
-    across = torch.eye(3, dtype=unit.dtype) - unit[:, :, None] * unit[:, None, :]
-    return torch.linalg.solve(across.sum(dim=0), (across @ places[..., None]).sum(dim=0).squeeze(-1))
+    across = torch.eye(3, dtype=unit.dtype) - unit[..., :, None] * unit[..., None, :]
+    sums = across.sum(dim=-3), (across @ places[..., None]).sum(dim=-3)
+    return (torch.linalg.pinv(sums[0], hermitian=True) @ sums[1]).squeeze(-1)

@@ -31,7 +31,14 @@ from torch import Tensor
 from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below, numbers, read_json
 from lp_framework.data.masks import HALF
 from lp_framework.data.photographs import read_image
-from lp_framework.data.real_cameras import frame_of_points, frame_of_silhouettes, from_pytorch3d, ndc_intrinsics
+from lp_framework.data.real_cameras import (
+    agreeing_views,
+    fitting_views,
+    frame_of_points,
+    frame_of_silhouettes,
+    from_pytorch3d,
+    ndc_intrinsics,
+)
 from lp_framework.data.sets.converted import Annotated, Photograph, PhotographedData
 from lp_framework.errors import UserError
 from lp_framework.registry import register
@@ -157,15 +164,30 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
         else:
             whole.append(photograph)
             pixels.append(found)
+    nothing = Annotated([], torch.zeros(1, 3, dtype=torch.float64), left_out, dict(scores))
     if len(whole) < 3:
-        return Annotated([], torch.zeros(1, 3, dtype=torch.float64), left_out, dict(scores))
+        return nothing
     cameras = torch.stack([photograph.camera for photograph in whole])
     intrinsics = torch.stack([photograph.intrinsics for photograph in whole])
-    frame, source = frame_of_silhouettes(cameras, intrinsics, pixels), "silhouettes"
-    if cloud is not None:
-        from_cloud = frame_of_points(cameras, read_points(cloud))
-        frame, source = (from_cloud, "point cloud") if from_cloud.agrees(frame) else (frame, source)
-    moved = [replace(each, camera=camera) for each, camera in zip(whole, frame.camera(cameras), strict=True)]
+    points = None if cloud is None else read_points(cloud)
+    if points is not None:
+        sound = fitting_views(cameras, intrinsics, pixels, points)
+        if 2 * sound.sum() <= len(whole):
+            points = None  # of something else
+    if points is None:
+        sound = agreeing_views(cameras, intrinsics, pixels)
+    chosen = sound.nonzero()[:, 0].tolist()
+    if wrong := [each.file.name for index, each in enumerate(whole) if index not in chosen]:
+        left_out[f"whose camera or mask does not fit the others' ({', '.join(wrong)})"] = len(wrong)
+    if len(chosen) < 3:
+        return nothing
+    cameras = cameras[chosen]
+    if points is None:
+        frame = frame_of_silhouettes(cameras, intrinsics[chosen], [pixels[index] for index in chosen])
+    else:
+        frame = frame_of_points(cameras, points)
+    moved = [replace(whole[index], camera=camera) for index, camera in zip(chosen, frame.camera(cameras), strict=True)]
+    source = "silhouettes" if points is None else "point cloud"
     return Annotated(moved, frame.corners(), left_out, {"object_frame": source, **scores})
 
 
