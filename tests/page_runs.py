@@ -95,6 +95,7 @@ def write_estimate(folder: Path) -> Path:
         writer = csv.writer(file)
         writer.writerow(["file", "image", *names, *(f"relative_{name}" for name in names), "energy", "valid"])
         writer.writerows(rows)
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": math.radians(49.1), "frames": []}))
     result = {"seconds": 1.5, "config": {"solver": {"name": "two_stage"}}, "versions": {"torch": "2.13"}}
     (folder / "results.json").write_text(json.dumps(result))
     return folder

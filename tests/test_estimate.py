@@ -102,6 +102,26 @@ def estimate(lp: Callable[..., Finished], *overrides: str) -> Finished:
 # ---------------------------------------------------------------- the command
 
 
+def test_a_field_of_view_that_the_solver_was_told_is_that_of_the_exports_and_pictures(
+    lp, write, tmp_path: Path, monkeypatch
+):
+    solver = SOLVER.replace("    def __init__", "    field_of_view_degrees = 30.0\n\n        def __init__")
+    write("plugins/tmp_brightness/tmp_brightness.py", solver)
+    for name in ("a", "b"):
+        placed(drawn(200, 160), 20, 30, 256, 256).save(tmp_path / f"{name}.png")
+    drawn_with = []
+    monkeypatch.setattr(
+        "lp_framework.report.plots._frustum", lambda *given: drawn_with.append(given[2]) or np.zeros((5, 3))
+    )
+    finished = estimate(lp, "images=[a.png,b.png]", "crop=false")
+    assert finished.status == 0, finished.err
+    transforms = json.loads((tmp_path / "run" / "transforms.json").read_text())
+    assert transforms["camera_angle_x"] == pytest.approx(math.radians(30))
+    cameras = (tmp_path / "run" / "colmap" / "cameras.txt").read_text().splitlines()[1].split()
+    assert float(cameras[4]) == float(cameras[5]) == pytest.approx(128 / math.tan(math.radians(15)))
+    assert drawn_with and drawn_with == pytest.approx([math.radians(30)] * len(drawn_with))
+
+
 def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
     finished = estimate(lp, "images=photos", "latitude_degrees=10", "radius=1.5")
     assert finished.status == 0, finished.err

@@ -7,6 +7,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +16,14 @@ from baseline_stand_ins import FIELD_OF_VIEW, KnownMatcher, know
 from exact_prior import image_of
 from solver_problems import exact_pairs
 from torch import Tensor
-from view_folders import write_objects
+from view_folders import random_poses, write_objects, write_split
 
 from lp_framework import registry
+from lp_framework.analysis.pairs import shown_pairs
+from lp_framework.data.module import PairDataModule
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.toy import toy_objects
+from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
 from lp_framework.geometry import (
     at_optimal_scale,
@@ -29,7 +33,7 @@ from lp_framework.geometry import (
     translation_error,
     wrap_angle,
 )
-from lp_framework.solvers.base import Pairs, Solution, ViewSets
+from lp_framework.solvers.base import Pairs, Solution, ViewSets, pairs_of
 from lp_framework.solvers.features import Features, Learned, Matches, Sift, foreground
 
 SIZE = 256
@@ -82,19 +86,87 @@ def test_exact_correspondences_give_the_exact_camera_and_pose():
     torch.testing.assert_close(answer[:, 2].double(), relative, rtol=0, atol=5e-3)
 
 
+class Zoomed(KnownMatcher):
+    """Matches in images whose fourth number is their field of view, degrees."""
+
+    def describe(self, image: Tensor) -> Tensor:
+        return image.flatten()[:4]
+
+    def match(self, reference: Tensor, query: Tensor) -> Matches:
+        centre = (self.size - 1) / 2
+        angles = [math.radians(each[3].item()) for each in (reference, query)]
+        zooms = [math.tan(math.radians(FIELD_OF_VIEW) / 2) / math.tan(angle / 2) for angle in angles]
+        matches = super().match(reference[:3], query[:3])
+        return Matches(*(centre + (each - centre) * zoom for each, zoom in zip(matches, zooms, strict=True)))
+
+
+def with_fields_of_view(poses: Tensor, degrees: list[float]) -> Pairs:
+    images = torch.nn.functional.pad(image_of(poses).float(), (0, SIZE - 8, 0, SIZE - 8))
+    images.flatten(1)[:, 3] = torch.tensor(degrees)
+    pairs = from_first(images)
+    return replace(pairs, field_of_view=torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("degrees", [[25.0] * 4, [80.0] * 4, [30.0, 49.1, 70.0, 45.0]])
+def test_each_view_has_its_own_field_of_view(degrees):
+    """Which the solver takes from the pairs, unless it was told one for all."""
+    pairs = with_fields_of_view(VIEWS, degrees)
+    true = VIEWS[:1].expand(3, 3), VIEWS[1:]
+    rotation, translation = errors(solve(with_matches(Zoomed(size=SIZE)), pairs), *true)
+    assert rotation.max() < 0.02 and translation.max() < 1e-3
+    without = replace(pairs, field_of_view=None)
+    assert errors(solve(with_matches(Zoomed(size=SIZE)), without), *true)[0].max() > 1
+    told = with_matches(Zoomed(size=SIZE), field_of_view_degrees=degrees[0])
+    assert (errors(solve(told, without), *true)[0].max() < 0.02) == (len({*degrees}) == 1)
+    torch.testing.assert_close(solve(told, pairs).poses, solve(told, without).poses, equal_nan=True)
+
+
+def test_another_zoom_from_the_same_place_is_the_same_view():
+    solution = solve(with_matches(Zoomed(size=SIZE)), with_fields_of_view(VIEWS[[0, 0]], [30.0, 60.0]))
+    assert solution.valid.all() and solution.energies.item() == 0 and solution.poses.abs().max() == 0
+
+
+def test_views_on_disk_are_solved_with_their_own_fields_of_view(tmp_path):
+    """From `transform.json` to the solver; crops to the object have lost theirs."""
+    path = write_split(tmp_path / "cup" / "test", random_poses(3, "any"), size=64)
+    content = json.loads(path.read_text())
+    content["frames"][1]["camera_angle_x"] = 0.4
+    path.write_text(json.dumps(content))
+    data = PairDataModule(RenderingsData(str(tmp_path)), str(tmp_path / "cache"), image_size=16)
+    pairs = pairs_of(data.data("test")[np.array([[2, 1], [1, 0]])], torch.device("cpu"))
+    assert pairs.field_of_view.tolist() == pytest.approx(
+        [math.radians(FIELD_OF_VIEW), 0.4, math.radians(FIELD_OF_VIEW)]
+    )
+    focal = Features().focal_lengths(pairs)
+    assert focal[1] == pytest.approx(8 / math.tan(0.2)) and focal[0] == focal[2] != focal[1]
+    sets = ViewSets(pairs.images, torch.tensor([[2, 1, 0]]), torch.tensor([0]), pairs.field_of_view)
+    assert sets.with_first().field_of_view is pairs.field_of_view
+    before = data.fingerprint("test")
+    content["frames"][1]["camera_angle_x"] = 0.5
+    path.write_text(json.dumps(content))
+    again = PairDataModule(RenderingsData(str(tmp_path)), str(tmp_path / "cache"), image_size=16, crop=True)
+    assert again.fingerprint("test") != before
+    cropped = pairs_of(again.data("test")[np.array([[2, 1]])], torch.device("cpu"))
+    for source, angle in ((data, 0.4), (again, math.radians(FIELD_OF_VIEW))):
+        _, (shown,) = shown_pairs(source.data("test"), np.array([[2, 1]]), torch.device("cpu"))
+        assert shown.query.field_of_view == pytest.approx(angle)
+    assert cropped.field_of_view is None and len({*Features().focal_lengths(cropped)}) == 1
+
+
 @pytest.mark.parametrize("degrees", [20.0, 49.1, 90.0])
 def test_another_field_of_view(degrees):
     """Matches at the angles of one field of view are right under it, and only under it."""
     matcher = KnownMatcher(size=SIZE)
     rotation = {}
     for assumed in (degrees, FIELD_OF_VIEW):
-        solver = with_matches(matcher, field_of_view_degrees=assumed)
+        solver = with_matches(matcher)
         zoom = math.tan(math.radians(FIELD_OF_VIEW) / 2) / math.tan(math.radians(degrees) / 2)
         found = []
         for query in VIEWS[1:3]:
             exact = matcher.match(VIEWS[0], query)
             points = [(each - (SIZE - 1) / 2) * zoom + (SIZE - 1) / 2 for each in exact]
-            camera, _ = solver.relative_camera(Matches(*points), SIZE, seed=0)
+            focal = SIZE / 2 / math.tan(math.radians(assumed) / 2)
+            camera, _ = solver.relative_camera(Matches(*points), SIZE, (focal, focal), seed=0)
             true = relative_camera(*camera_to_world(torch.stack([VIEWS[0], query])))
             flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
             found.append(rotation_error(flip @ torch.from_numpy(camera) @ flip, true).item())
@@ -140,6 +212,21 @@ def views() -> Tensor:
     alpha = rendered[..., 3:] / 255
     pixels = rendered[..., :3] * alpha + 255 * (1 - alpha)
     return torch.from_numpy(pixels).permute(0, 3, 1, 2) / 127.5 - 1
+
+
+def test_rendered_views_of_other_fields_of_view():
+    """Of a pair taken with 30 and 65 degrees, as far away as they show the object about as large."""
+    (cottage,) = (toy for toy in toy_objects() if toy.name == "cottage")
+    poses, degrees, images = VIEWS[:2].clone(), (30.0, 65.0), []
+    for pose, angle in zip(poses, degrees, strict=True):
+        pose[2] *= math.tan(math.radians(FIELD_OF_VIEW) / 2) / math.tan(math.radians(angle) / 2)
+        rendered = RaycastRenderer().render(cottage.load(), camera_to_world(pose[None]), SIZE, angle).astype(np.float32)
+        alpha = rendered[..., 3:] / 255
+        images.append(rendered[..., :3] * alpha + 255 * (1 - alpha))
+    pairs = from_first(torch.from_numpy(np.concatenate(images)).permute(0, 3, 1, 2) / 127.5 - 1)
+    own = replace(pairs, field_of_view=torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)))
+    rotation, wrong = (errors(solve(Features(), each), poses[:1], poses[1:])[0].item() for each in (own, pairs))
+    assert rotation < 1.5 and wrong > 10
 
 
 def test_small_baselines_are_found_and_a_wide_one_is_not(views):
@@ -192,7 +279,7 @@ def test_too_few_matches(count):
 def test_too_few_inliers():
     random = np.random.default_rng(0)
     matches = Matches(*random.uniform(0, SIZE, (2, 40, 2)))
-    assert Features(tolerance_pixels=0.2).relative_camera(matches, SIZE, seed=0) is None
+    assert Features(tolerance_pixels=0.2).relative_camera(matches, SIZE, (FOCAL, FOCAL), seed=0) is None
 
 
 def test_a_set_of_images_with_one_that_shows_nothing(views):

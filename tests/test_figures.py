@@ -181,7 +181,7 @@ def test_a_camera_panel_has_every_camera():
     wild = predicted.copy()
     wild[0, 1] = math.nan  # a start that failed
     images = [Image.new("RGBA", (8, 8))] * 4
-    scene = CameraScene("cup", images, poses, math.radians(49), [predicted, wild], ["", ""])
+    scene = CameraScene("cup", images, poses, np.full(4, math.radians(49)), [predicted, wild], ["", ""])
     figure = camera_methods_figure([scene, scene], ["one", "other"])
     counted = [
         {kind: [each for each in axes.collections if each.get_gid() == kind] for kind in ("true", "predicted")}
@@ -244,7 +244,7 @@ def test_a_rendered_view_at_the_references_own_pose_is_the_reference(meshes):
     # Half a turn around is the reference's pose again, half a turn on.
     _, (shown,) = named_pairs(meshes, ["box"], [(0, 1)], CPU)
     pose = torch.from_numpy(shown.reference.pose)[None]
-    turned = figure.rendered("box", pose + torch.tensor([0.0, math.pi, 0.0]))
+    turned = figure.rendered(shown, pose + torch.tensor([0.0, math.pi, 0.0]))
     assert turned is not None
     np.testing.assert_allclose(turned[0], row.rendered[2], atol=1 / 255)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import gzip
 import importlib.util
 import json
+import math
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -101,6 +103,8 @@ def page_of(folder: Path) -> Page:
 
 def test_examples_come_back_as_they_were_saved(tmp_path):
     saved = example(NASTY, 170.0)
+    query = dataclasses.replace(saved.query, field_of_view=0.5)
+    saved = dataclasses.replace(saved, query=query)
     save_examples(tmp_path / "a", [example(), saved])
     _, read = read_examples(tmp_path / "a")
     assert (read.object, read.ambiguity, read.reason, read.chosen) == (NASTY, "unique", saved.reason, 1)
@@ -108,6 +112,7 @@ def test_examples_come_back_as_they_were_saved(tmp_path):
     for name in ("truth", "starts", "trajectories", "ends", "energies", "rotation_errors", "translation_errors"):
         np.testing.assert_allclose(getattr(read, name), getattr(saved, name), rtol=1e-5, atol=1e-9)
     assert np.array_equal(read.query.image, saved.query.image) and read.query.name == "001.png"
+    assert read.query.field_of_view == 0.5 and read.reference.field_of_view == math.radians(49.1)
     assert read.landscapes.keys() == saved.landscapes.keys()
     assert all(torch_equal(read.landscapes[name], saved.landscapes[name]) for name in saved.landscapes)
 
@@ -191,7 +196,7 @@ def evaluation() -> tuple[Evaluation, PairData]:
         poses = torch.tensor([-0.2, 0.5, 1.3]) + unit * torch.tensor([0.4, 4.0, 0.4])
         files = [Path(f"{view:03d}.png") for view in range(3)]
         kind = "unique" if unique else "continuous"
-        objects.append(ObjectViews(name, "test", kind, unique, files, camera_to_world(poses), 0.857))
+        objects.append(ObjectViews(name, "test", kind, unique, files, camera_to_world(poses), torch.full((3,), 0.857)))
     data = Exact(ViewTable(objects), np.zeros((24, 8, 8, 3), dtype=np.uint8), None)
     solver = TwoStage(Tells(), ExactPrior((0.0, torch.pi), (0.0, 0.3)), gamma=0.0, iterations=12, refinement_steps=8)  # type: ignore[arg-type]
     evaluation = Evaluation(solver, Ring(3), seed=0)

@@ -234,7 +234,7 @@ def test_validation_noise_is_the_pairs_own_whatever_else_the_data_hold():
     def views_of(name: str) -> ObjectViews:
         poses = torch.rand(3, 3, generator=torch.Generator().manual_seed(len(name)), dtype=torch.float64) + 1
         files = [Path(f"{name}/train/rgb/{index:03d}.png") for index in range(3)]
-        return ObjectViews(name, "train", "unlabelled", None, files, camera_to_world(poses), 0.8)
+        return ObjectViews(name, "train", "unlabelled", None, files, camera_to_world(poses), torch.full((3,), 0.8))
 
     def losses(names: Sequence[str]) -> list[float]:
         """Of the pairs of the last object."""

@@ -1,6 +1,7 @@
 import itertools
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def views_of(name: str, count: int) -> ObjectViews:
     """Views whose files are not there; nothing here opens them."""
     files = [Path(f"{name}/test/rgb/{index:03d}.png") for index in range(count)]
     cameras = camera_to_world(torch.from_numpy(random_poses(count, name)))
-    return ObjectViews(name, "test", "unlabelled", None, files, cameras, FIELD_OF_VIEW)
+    return ObjectViews(name, "test", "unlabelled", None, files, cameras, torch.full((count,), FIELD_OF_VIEW))
 
 
 def table_of(*counts: int, names: str = NAMES) -> ViewTable:
@@ -145,7 +146,7 @@ def test_pair_ids_follow_the_pairs_in_any_order():
 
 def test_pair_ids_do_not_depend_on_where_the_data_lies():
     here, there = views_of("a", 3), views_of("a", 3)
-    moved = ObjectViews("a", "test", "unlabelled", None, [Path("/x") / f for f in there.files], there.cameras, 0.8)
+    moved = replace(there, files=[Path("/x") / f for f in there.files], field_of_view=there.field_of_view + 0.1)
     pairs = np.array([[0, 1], [1, 2]])
     batches = [PairData(ViewTable([views]), None, None)[pairs] for views in (here, moved)]
     assert torch.equal(batches[0].ids, batches[1].ids)

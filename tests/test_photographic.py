@@ -81,7 +81,7 @@ def test_renderings_of_other_cameras_depths_and_sizes_are_decoded_anew(box, tmp_
     small, pixels = decoded_renderings([views], 0.5, 64, tmp_path)
     assert pixels["pixels"].shape == (4, 64, 64, 3)
     nearer, _ = decoded_renderings([replace(views, cameras=views.cameras * 1.1)], 0.5, SIZE, tmp_path)
-    wider, _ = decoded_renderings([replace(views, field_of_view=0.8)], 0.5, SIZE, tmp_path)
+    wider, _ = decoded_renderings([replace(views, field_of_view=views.field_of_view + 0.1)], 0.5, SIZE, tmp_path)
     file = box / "box" / "train" / "depth" / "001.png"
     kept = file.read_bytes()
     Image.fromarray(np.full((SIZE, SIZE), 9_000, np.uint16)).save(file)

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -112,6 +113,41 @@ def test_other_encodings_of_json_load(path):
     (path.parent / "rgb" / "000.png").rename(image)
     path.write_bytes(json.dumps({**json.loads(text)}, ensure_ascii=False).replace("000.png", "vue_été.png").encode())
     assert read(path).files[0] == image
+
+
+def test_each_view_may_have_its_own_field_of_view(path):
+    """`camera_angle_x`, or nerfstudio's and instant-ngp's focal lengths; a frame's own before the file's."""
+    rewrite_frame(path, 1, camera_angle_x=0.5)
+    rewrite_frame(path, 2, fl_x=16.0, w=16)
+    expected = [FIELD_OF_VIEW, 0.5, 2 * math.atan(0.5)]
+    assert read(path).field_of_view.dtype == torch.float64
+    assert read(path).field_of_view.tolist() == pytest.approx(expected)
+    content = json.loads(path.read_text())
+    del content["camera_angle_x"]
+    focal = 8 / math.tan(FIELD_OF_VIEW / 2)
+    path.write_text(json.dumps({**content, "fl_x": focal, "fl_y": focal, "cx": 8.0, "cy": 7.95, "w": 16, "h": 16}))
+    assert read(path).field_of_view.tolist() == pytest.approx(expected)
+    rewrite(path, camera_angle_x=FIELD_OF_VIEW)
+    assert read(path).field_of_view.tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "message"),
+    [
+        ({"fl_x": 16.0}, r"needs camera_angle_x .*KeyError: 'w'"),
+        ({"fl_x": 0, "w": 16}, r"needs camera_angle_x .*ZeroDivisionError"),
+        ({"fl_x": -16.0, "w": 16}, "camera_angle_x must be an angle"),
+        ({"fl_x": 16.0, "w": 16, "fl_y": 17.0}, "pixels must be square and their cameras centred"),
+        ({"fl_x": 16.0, "w": 16, "cx": 6.0}, "and cx and cy the image's middle"),
+        ({"fl_x": 16.0, "w": 16, "cy": math.nan}, "and cx and cy the image's middle"),
+        ({"fl_x": 16.0, "w": 16, "camera_angle_x": 0.5}, "camera_angle_x is 0.5, but fl_x and w say 0.9273 radians"),
+        ({"camera_angle_x": 49.1}, "must be an angle in radians between 0 and pi, got 49.1"),
+        ({"camera_angle_x": None}, "needs camera_angle_x"),
+    ],
+)
+def test_intrinsics_of_a_frame_that_are_none(path, intrinsics, message):
+    rewrite_frame(path, 1, **intrinsics)
+    assert re.search(message, sentence(path))
 
 
 def test_small_deviations_from_spherical_cameras_are_kept_not_mended(path):
@@ -294,7 +330,10 @@ def check_refused_or_sound(path: Path, content: object) -> None:
         assert str(path) in str(error) and "\n" not in str(error)
         return
     assert len(views) == len(views.cameras) > 0 and views.poses.isfinite().all() and (views.poses[:, 2] > 0).all()
-    assert all(file.is_file() for file in views.files) and 0 < views.field_of_view < math.pi
+    assert (
+        all(file.is_file() for file in views.files)
+        and ((views.field_of_view > 0) & (views.field_of_view < math.pi)).all()
+    )
 
 
 @pytest.fixture(scope="module")

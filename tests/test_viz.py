@@ -397,7 +397,9 @@ def data() -> PairData:
             [0, 0, 1.2]
         )
         files = [Path(f"{view:03d}.png") for view in range(4)]
-        objects.append(ObjectViews(name, "test", ambiguity, unique, files, camera_to_world(poses), 0.857))
+        objects.append(
+            ObjectViews(name, "test", ambiguity, unique, files, camera_to_world(poses), torch.full((4,), 0.857))
+        )
     images = torch.randint(0, 256, (8, 8, 8, 3), generator=generator, dtype=torch.uint8).numpy()
     return PairData(ViewTable(objects), images, None)
 

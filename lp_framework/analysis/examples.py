@@ -162,8 +162,8 @@ def as_json(example: ShownPair) -> dict[str, Any]:
     """All of an example but pixels and maps, as names, lists and numbers (null for what is not finite)."""
     return {
         **{name: getattr(example, name) for name in ("object", "ambiguity", "reason")},
-        "reference": {"file": example.reference.name, "pose": _numbers(example.reference.pose)},
-        "query": {"file": example.query.name, "pose": _numbers(example.query.pose)},
+        "reference": _view_as_json(example.reference),
+        "query": _view_as_json(example.query),
         **{name: _numbers(getattr(example, name)) for name in ARRAYS},
         "chosen": example.chosen or 0,
         "landscapes": [
@@ -177,11 +177,18 @@ def as_json(example: ShownPair) -> dict[str, Any]:
     }
 
 
+def _view_as_json(view: View) -> dict[str, Any]:
+    return {"file": view.name, "pose": _numbers(view.pose), "field_of_view": view.field_of_view}
+
+
 def _example(folder: Path, number: int, entry: Mapping[str, Any]) -> ShownPair:
     def view(name: str) -> View:
         with Image.open(folder / f"{number}_{name}.png") as image:
             pixels = np.asarray(image.convert("RGB"))
-        return View(Path(entry[name]["file"]), pixels, _array(entry[name]["pose"]))
+        seen = entry[name]
+        return View(
+            Path(seen["file"]), pixels, _array(seen["pose"]), float(seen.get("field_of_view", View.field_of_view))
+        )
 
     values: dict[str, Any] = {name: _array(entry[name]) for name in ARRAYS if entry[name] is not None}
     if not 0 <= (chosen := int(entry["chosen"])) < len(values["ends"]):

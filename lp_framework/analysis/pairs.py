@@ -7,6 +7,7 @@ return the arrays with more in them.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from lp_framework.analysis import fields
 from lp_framework.analysis.landscapes import Arrows, Grid, Landscape, landscape_grid
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairData
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError, nearest
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.geometry import apply_relative_pose, camera_to_world, rotation_error
@@ -34,11 +36,13 @@ PRIOR_ENERGY = "energy of the prior"
 
 @dataclass(frozen=True)
 class View:
-    """One image of a pair: its file, its pixels `[H, W, 3]` (uint8) and its true view pose `[3]`."""
+    """One image of a pair: its file, its pixels `[H, W, 3]` (uint8), its true view pose `[3]` and its field of view
+    (radians), by default that of the priors, as for crops to the object."""
 
     file: Path
     image: NDArray
     pose: NDArray
+    field_of_view: float = math.radians(FIELD_OF_VIEW_DEGREES)
 
     @property
     def name(self) -> str:
@@ -140,8 +144,10 @@ def shown_pairs(data: PairData, views: NDArray[np.int64], device: torch.device) 
     for pair, truth in zip(views, batch.relative_poses().numpy(), strict=True):
         index = int(table.object_of_view[pair[0]])
         reference, query = (
-            View(table.files[view], np.asarray(images[view]), table.poses[view].numpy()) for view in pair
-        )
+            View(table.files[view], np.asarray(images[view]), table.poses[view].numpy(),
+                 View.field_of_view if data.crop else table.field_of_view[view].item())
+            for view in pair
+        )  # fmt: skip
         shown.append(ShownPair(table.names[index], table.ambiguities[index], "", reference, query, truth))
     return pairs_of(batch, device), shown
 

@@ -82,7 +82,8 @@ def run(config: DictConfig) -> None:
         if photograph.made and photograph.mask is not None:
             (folder / MASKS).mkdir(exist_ok=True)
             save_png(folder / MASKS / f"{index:03d}.png", photograph.mask)
-    rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist(), told)
+    degrees = solver.field_of_view_degrees or FIELD_OF_VIEW_DEGREES
+    rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist(), told, degrees)
     _print(folder, rows, told, radius_lost, result["masks_by"] is not None)
     if not told or any(answer.verdict != "trust" for answer in told):
         warn_of_prior(components)
@@ -123,9 +124,10 @@ def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
 
 def _write(
     folder: Path, files: Sequence[Path], prepared: Sequence[Image.Image], poses: Tensor, energies: Sequence[float],
-    told: Sequence[Answer],
+    told: Sequence[Answer], degrees: float,
 ) -> list[list[Any]]:  # fmt: skip
-    """The images and their cameras, of absolute and relative poses `[I, 6]`; returns the rows of `poses.csv`."""
+    """The images and their cameras, of absolute and relative poses `[I, 6]` and this field of view; returns the rows of
+    `poses.csv`."""
     images = [f"images/{index:03d}.png" for index in range(len(files))]
     (folder / "images").mkdir(exist_ok=True)
     for image, picture in zip(images, prepared, strict=True):
@@ -144,14 +146,14 @@ def _write(
     write_csv(folder / "poses.csv", COLUMNS, [[*row, *note] for row, note in zip(rows, notes, strict=True)])
     found = [index for index, is_pose in enumerate(valid) if is_pose]
     cameras, names = poses[found, :3], [Path(images[index]).name for index in found]
-    transforms = nerf_transforms([images[index] for index in found], cameras, FIELD_OF_VIEW_DEGREES)
+    transforms = nerf_transforms([images[index] for index in found], cameras, degrees)
     write_json(folder / "transforms.json", transforms)
     (folder / "colmap").mkdir(exist_ok=True)
-    for name, text in colmap_model(names, cameras, SIZE, FIELD_OF_VIEW_DEGREES).items():
+    for name, text in colmap_model(names, cameras, SIZE, degrees).items():
         write_text(folder / "colmap" / name, text)
     pictures, titles = [prepared[index] for index in found], [files[index].name for index in found]
     verdicts = [str(notes[index][2]) for index in found]
-    figure = cameras_figure(cameras.numpy(), pictures, found, titles, FIELD_OF_VIEW_DEGREES, verdicts)
+    figure = cameras_figure(cameras.numpy(), pictures, found, titles, degrees, verdicts)
     save_figure(figure, folder / "cameras")
     return rows
 

@@ -109,7 +109,8 @@ class PairDataModule(LightningDataModule):
             self.data(split)
         names = [file.name for file in table.files]
         labels = list(zip(table.names, table.counts, table.ambiguities, table.unique_answer, strict=True))
-        return content_key([], "split", self._image_keys[folder], names, labels, table.cameras.tolist())
+        return content_key([], "split", self._image_keys[folder], names, labels, table.cameras.tolist(),
+                           table.field_of_view.tolist())  # fmt: skip
 
     def _on_disk(self, split: str) -> list[ObjectViews]:
         folder = _folder(split)
@@ -137,8 +138,8 @@ class PairDataModule(LightningDataModule):
             raise UserError(f"object '{views.name}' has {len(views)} training views; {wanted}")
         order = np.random.default_rng([self.seed, stable_id(views.name)]).permutation(len(views))
         kept = np.sort(order[:count] if held_out else order[count:])
-        files, cameras = [views.files[index] for index in kept], views.cameras[torch.from_numpy(kept)]
-        return replace(views, files=files, cameras=cameras)
+        files, index = [views.files[index] for index in kept], torch.from_numpy(kept)
+        return replace(views, files=files, cameras=views.cameras[index], field_of_view=views.field_of_view[index])
 
     def evaluate_on(self, protocol: str, seed: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
         """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
@@ -179,12 +180,12 @@ class PairDataModule(LightningDataModule):
         table = self.table(split)
         # Training and validation views share one array, so that another way to divide them decodes nothing anew.
         files = [file for views in self._on_disk(split) for file in views.files]
+        crop = self.crop and split in ("test", "all_train")
         if _folder(split) == "train" and (self.photographs or "points" in self._carried):
             key, views = decoded_renderings(self._on_disk(split), self.photographs, self.image_size, self.cache)
             images = views["pixels"]
             arrays = {"points": views["points"], "cropped": views["cropped"]}
         else:
-            crop = self.crop and split in ("test", "all_train")
             key, images = decoded_views(files, self.image_size, self.cache, crop)
             arrays = {}
         arrays["images"] = images
@@ -199,10 +200,10 @@ class PairDataModule(LightningDataModule):
                 self.cache, feature_key, len(files), lambda: _extracted(extractor, images, device)
             )
         if files == table.files:
-            return PairData(table, **arrays)
+            return PairData(table, **arrays, crop=crop)
         place = {file: row for row, file in enumerate(files)}
         rows = np.array([place[file] for file in table.files])
-        return PairData(table, **{name: Rows(array, rows) for name, array in arrays.items()})
+        return PairData(table, **{name: Rows(array, rows) for name, array in arrays.items()}, crop=crop)
 
     def _device(self) -> torch.device:
         """Where the networks are going to be."""

@@ -40,6 +40,7 @@ class PairBatch:
     depth: Tensor | None = None  # [I, H, W] (float32) along the optical axis in scene units, 0 where there is nothing
     points: Tensor | None = None  # [I, C^2, 3] (float16) that C x C cells show, in the object's frame, NaN: nothing
     cropped: Tensor | None = None  # [I], whether a view is a crop to the object, which has lost its distance
+    field_of_view: Tensor | None = None  # [I], radians (float64), on the CPU; None: all are crops, which have lost it
     relative: Tensor | None = None  # see `relative_poses`, once the batch has gone to a device
 
     def __len__(self) -> int:
@@ -65,11 +66,11 @@ class PairBatch:
         return self.relative
 
     def to(self, device: torch.device) -> PairBatch:
-        """The batch on a device, but for the truth: `poses` and `cameras` are float64, which not every device has."""
+        """The batch on a device, but for what is float64, which not every device has."""
         moved: dict[str, Any] = {
             name: value.to(device)
             for name, value in vars(self).items()
-            if isinstance(value, Tensor) and name not in ("poses", "cameras")
+            if isinstance(value, Tensor) and name not in ("poses", "cameras", "field_of_view")
         }
         return replace(self, **moved | {"relative": self.relative_poses().to(device)})
 
@@ -86,6 +87,7 @@ class ViewTable:
         self.view_names = [f"{views.name}/{file.name}" for views in objects for file in views.files]
         self.cameras = torch.cat([views.cameras for views in objects])
         self.poses = torch.cat([views.poses for views in objects])
+        self.field_of_view = torch.cat([views.field_of_view for views in objects])
         self.counts = [len(views) for views in objects]
         self.object_of_view = torch.repeat_interleave(torch.arange(len(objects)), torch.tensor(self.counts))
         self._starts = np.cumsum([0, *self.counts])
@@ -145,7 +147,8 @@ class Rows:
 class PairData(Dataset[PairBatch]):
     """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
 
-    `images` (uint8), `features`, `alpha` and `depth`, where they are given, have a row a view of the table.
+    `images` (uint8), `features`, `alpha` and `depth`, where they are given, have a row a view of the table; `crop`:
+    all images are crops to the object.
     """
 
     def __init__(
@@ -157,9 +160,10 @@ class PairData(Dataset[PairBatch]):
         depth: NDArray | Rows | None = None,
         points: NDArray | Rows | None = None,
         cropped: NDArray | Rows | None = None,
+        crop: bool = False,
     ) -> None:
         self.table, self.images, self.features, self.alpha, self.depth = table, images, features, alpha, depth
-        self.points, self.cropped = points, cropped
+        self.points, self.cropped, self.crop = points, cropped, crop
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
         views, place = np.unique(pairs, return_inverse=True)
@@ -183,6 +187,7 @@ class PairData(Dataset[PairBatch]):
             depth=rows(self.depth),
             points=rows(self.points),
             cropped=rows(self.cropped),
+            field_of_view=None if self.crop else self.table.field_of_view[index],
         )
 
 

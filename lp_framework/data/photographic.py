@@ -114,11 +114,12 @@ def decoded_renderings(
         for each in tracked(views, "decoding renderings"):
             block = np.zeros(len(each), record)
             cropped = np.random.default_rng(stable_id(each.name)).random() < share
-            rows = zip(each.files, depth_files(each.files), each.cameras.numpy(), strict=True)
-            for row, (file, depth, camera) in enumerate(rows):
+            seen = each.cameras.numpy(), each.field_of_view.tolist()
+            rows = zip(each.files, depth_files(each.files), *seen, strict=True)
+            for row, (file, depth, camera, field_of_view) in enumerate(rows):
                 with opened(file) as image, opened(depth) as levels:
                     pixels = np.asarray(image.convert("RGBA"))
-                    points = _points(scene_depth(levels), camera, each.field_of_view)
+                    points = _points(scene_depth(levels), camera, field_of_view)
                 random = np.random.default_rng(stable_id(f"{each.name}/{file.name}"))
                 if cropped:
                     pixels, points = like_photograph(pixels, points, random)
@@ -127,7 +128,7 @@ def decoded_renderings(
                 block[row]["cropped"] = cropped
             yield block
 
-    seen_from = [(each.name, each.cameras.tolist(), each.field_of_view) for each in views]
+    seen_from = [(each.name, each.cameras.tolist(), each.field_of_view.tolist()) for each in views]
     key = content_key([*files, *depth_files(files)], "renderings by object", share, size, CELLS, seen_from)
     return key, cached_array(folder, key, len(files), blocks)
 

@@ -5,7 +5,8 @@
     <root>/<object>/{train,test}/depth/000.png ...  optional, 16 bits: `DEPTH_UNIT`s along the optical axis, 0: nothing
 
 `transform_matrix` is camera-to-world (OpenGL) and is the truth; iFusion's `latlon` counts latitude downwards and is
-not read. `file_path` is relative to `rgb`, or to the folder of `transform.json`. `ambiguity`, `unique_answer` and the
+not read. `file_path` is relative to `rgb`, or to the folder of `transform.json`. The field of view may also be given by
+`fl_x` and `w` (pixels), and by each frame for itself. `ambiguity`, `unique_answer` and the
 depths are our own optional additions.
 """
 
@@ -32,6 +33,7 @@ from lp_framework.registry import register
 AMBIGUITIES = ("unique", "twofold", "continuous", "unlabelled")
 TRANSFORMS = "transform.json"
 FIELD_OF_VIEW_DEGREES = 49.1  # of the priors, and of views that are made here
+LARGEST_OFFSET = 0.01  # radians, and shares of a side: what of a view's intrinsics is taken for rounding
 DEPTH_UNIT = 1e-4  # scene units a level of a depth image
 
 
@@ -45,7 +47,7 @@ class ObjectViews:
     unique_answer: bool | None
     files: list[Path]
     cameras: Tensor = field(repr=False)  # [V, 4, 4], camera to world, float64
-    field_of_view: float  # radians
+    field_of_view: Tensor = field(repr=False)  # [V], radians, float64
 
     def __len__(self) -> int:
         return len(self.files)
@@ -58,12 +60,13 @@ class ObjectViews:
 
 def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
     """The views of an object in a split ("train" or "test"); `UserError` naming the file for a missing or malformed
-    `transform.json`, a missing image, and a matrix that is not a camera that looks at the origin."""
+    `transform.json`, a missing image, a matrix that is not a camera that looks at the origin, and pixels that are not
+    square or not about the image's middle."""
     path = Path(root) / name / split / TRANSFORMS
     content = read_json(path)
     with expecting(f"{path}: needs camera_angle_x and frames with file_path and transform_matrix"):
-        field_of_view = float(content["camera_angle_x"])
         frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
+        angles = [_field_of_view(content, frame, path) for frame in content["frames"] or [{}]]
     ambiguity, unique_answer = content.get("ambiguity", "unlabelled"), content.get("unique_answer")
     if ambiguity not in AMBIGUITIES:
         raise UserError(f"{path}: ambiguity {ambiguity!r} is none of {', '.join(AMBIGUITIES)}")
@@ -71,8 +74,6 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
         raise UserError(f"{path}: unique_answer must be true, false or null, got {unique_answer!r}")
     if not frames:
         raise UserError(f"{path}: has no frames")
-    if not 0 < field_of_view < math.pi:
-        raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {field_of_view}")
     files, cameras = [], []
     for index, (file_path, matrix) in enumerate(frames):
         places = [folder / file_path for folder in (path.parent / "rgb", path.parent)]
@@ -83,7 +84,30 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
             camera = numbers(matrix, 4, 4)
         check_upright(camera, f"{path}: the camera of frame {index}")
         cameras.append(camera)
+    field_of_view = torch.tensor(angles, dtype=torch.float64)
     return ObjectViews(name, split, ambiguity, unique_answer, files, torch.stack(cameras), field_of_view)
+
+
+def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -> float:
+    """The field of view (radians) of a frame, by its own intrinsics or else by those of its file; raises anything."""
+    every = {**content, **frame}
+    own = frame if {"camera_angle_x", "fl_x"} & frame.keys() else content
+    angle = float(own["camera_angle_x"]) if "camera_angle_x" in own or "fl_x" not in own else None
+    if "fl_x" in own:
+        focal, width = float(own["fl_x"]), float(every["w"])
+        height = float(every.get("h", width))
+        stretched = float(own.get("fl_y", focal)) / focal - 1
+        aside = (float(every.get("cx", width / 2)) / width - 0.5, float(every.get("cy", height / 2)) / height - 0.5)
+        if not all(abs(each) <= LARGEST_OFFSET for each in (stretched, *aside)):
+            wanted = "fl_x and fl_y must be equal, and cx and cy the image's middle"
+            raise UserError(f"{path}: the views' pixels must be square and their cameras centred: {wanted}")
+        by_focal = 2 * math.atan(width / 2 / focal)
+        if angle is not None and not abs(angle - by_focal) <= LARGEST_OFFSET:
+            raise UserError(f"{path}: camera_angle_x is {angle:.4g}, but fl_x and w say {by_focal:.4g} radians")
+        angle = by_focal
+    if angle is None or not 0 < angle < math.pi:
+        raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {angle}")
+    return angle
 
 
 def write_transforms(folder: Path, frames: list[dict[str, Any]], **more: Any) -> None:

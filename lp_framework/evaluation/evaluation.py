@@ -81,7 +81,8 @@ class Evaluation(LightningModule):
             return self.solver.solve(pairs, starts, self.seed)
         ids = pairs.ids.view(-1, self.views - 1)
         views = torch.cat([pairs.reference.view_as(ids)[:, :1], pairs.query.view_as(ids)], dim=1)
-        view_sets = ViewSets(pairs.images, views, keyed_bits(*ids.unbind(dim=1), count=1)[:, 0].to(ids.device))
+        set_ids = keyed_bits(*ids.unbind(dim=1), count=1)[:, 0].to(ids.device)
+        view_sets = ViewSets(pairs.images, views, set_ids, pairs.field_of_view)
         solution = self.solver.solve_views(view_sets, starts.unflatten(0, ids.shape), self.seed)
         return Solution(
             poses=solution.poses.flatten(0, 1)[:, None],

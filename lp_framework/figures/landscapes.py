@@ -144,17 +144,18 @@ class FailuresFigure(EnergyFigure):
             poses = apply_relative_pose(torch.from_numpy(pair.reference.pose), around.double())
             code, sampling = codes[number : number + 1], (self.sampling_steps, self.guidance, seed)
             generated = fields.generated_views(self.prior, code, around, *sampling)
-            rows.append(maps.FailureRow(pair, self.rendered(pair.object, poses), generated))
+            rows.append(maps.FailureRow(pair, self.rendered(pair, poses), generated))
         return rows
 
-    def rendered(self, name: str, poses: Tensor) -> NDArray | None:
-        """Views `[K, H, W, 3]` in [0, 1] of an object's mesh from view poses `[K, 3]`; None where there is no mesh."""
+    def rendered(self, pair: ShownPair, poses: Tensor) -> NDArray | None:
+        """Views `[K, H, W, 3]` in [0, 1] of a pair's object from view poses `[K, 3]`, with the reference's field of
+        view; None where there is no mesh."""
         source = self.data.source
         if not isinstance(source, RenderedData):
             return None
-        scene = next(each for each in source.objects() if each.name == name).load()
-        field_of_view = self.data.table("test").objects[object_index(self.data, name)].field_of_view
-        views = source.renderer.render(scene, camera_to_world(poses), RESOLUTION, math.degrees(field_of_view)) / 255
+        scene = next(each for each in source.objects() if each.name == pair.object).load()
+        degrees = math.degrees(pair.reference.field_of_view)
+        views = source.renderer.render(scene, camera_to_world(poses), RESOLUTION, degrees) / 255
         alpha = views[..., 3:]
         return np.asarray(views[..., :3] * alpha + 1 - alpha)
 

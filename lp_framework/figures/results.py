@@ -73,7 +73,7 @@ class CamerasFigure(PaperFigure):
                     words(self.objects[number]),
                     [read_image(file).convert("RGBA") for file in each.files[: targets + 1]],
                     each.poses[: targets + 1].numpy(),
-                    each.field_of_view,
+                    each.field_of_view[: targets + 1].numpy(),
                     [apply_relative_pose(each.poses[0], relative).numpy() for relative in ends],
                     [f"{(off <= NEAR_DEGREES).sum()} of {off.size} within {NEAR_DEGREES:g}°" for off in errors],
                 )

@@ -327,7 +327,8 @@ def _cameras(folder: Path) -> dict[str, Any]:
     shown = rows[:MOST_CAMERAS]
     poses = np.array([[float(row[key]) for key in POSE] for row in shown])
     poses[:, :2] = np.radians(poses[:, :2])
-    figure = plots.cameras_plot(poses, [_image(folder, row) for row in shown])
+    field_of_view = float(_read(folder / "transforms.json", json.loads)["camera_angle_x"])
+    figure = plots.cameras_plot(poses, [_image(folder, row) for row in shown], field_of_view)
     return {"figure": figure, "shown": len(shown), "count": len(rows)}
 
 

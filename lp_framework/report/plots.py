@@ -21,7 +21,6 @@ from scipy.interpolate import RegularGridInterpolator
 
 from lp_framework.analysis.landscapes import Landscape
 from lp_framework.analysis.pairs import ShownPair
-from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz.cameras import ROUND, SPOKES, image_plane
@@ -106,14 +105,16 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
     return figure
 
 
-def cameras_plot(poses: NDArray, images: Sequence[NDArray]) -> go.Figure:
-    """Cameras at view poses `[V, 3]` with their images `[S, S, 4]`; that of the first also stands for the object."""
+def cameras_plot(poses: NDArray, images: Sequence[NDArray], field_of_view: float) -> go.Figure:
+    """Cameras of one field of view (radians) at view poses `[V, 3]` with their images `[S, S, 4]`; that of the first
+    also stands for the object."""
     furthest = float(poses[:, 2].max())
     figure = _space(1.1 * furthest, poses[0, 1])
-    figure.add_trace(_image(_frustum(poses[0], poses[0, 2]), images[0], 2 * PIXELS))
+    figure.add_trace(_image(_frustum(poses[0], poses[0, 2], field_of_view), images[0], 2 * PIXELS))
     colours = [REFERENCE, *[ANSWER] * (len(poses) - 1)]
     for pose, image, colour in zip(poses, images, colours, strict=True):
-        _add_camera(figure, pose, image, furthest * (0.26 if len(poses) > 5 else 0.34), colour, 4)
+        frustum = _frustum(pose, furthest * (0.26 if len(poses) > 5 else 0.34), field_of_view)
+        _add_camera(figure, frustum, image, colour, 4)
     text = {"text": [str(number) for number in range(len(poses))], "textposition": "top center", "textfont": FONT}
     marker = {"color": colours, "size": 5}
     return figure.add_trace(_trace(_centres(poses), mode="markers+text", marker=marker, hoverinfo="text", **text))
@@ -194,15 +195,16 @@ def pair_cameras_plot(pair: ShownPair) -> go.Figure:
         ball = _ball(np.radians(latitude) + reference[0], np.radians(longitude) + reference[1], GLOBE)
         shade = {"intensity": _numbers(energy.ravel()), "colorscale": RELIEF, "showscale": False}
         figure.add_mesh3d(**ball, **shade, **_of(pair, name), **look)
-    _add_camera(figure, reference, pair.reference.image, distance, REFERENCE, 5)
+    angles = pair.reference.field_of_view, pair.query.field_of_view
+    _add_camera(figure, _frustum(reference, distance, angles[0]), pair.reference.image, REFERENCE, 5)
     if query is not None:
-        _add_camera(figure, query, pair.query.image, distance, TRUTH, 5)
+        _add_camera(figure, _frustum(query, distance, angles[1]), pair.query.image, TRUTH, 5)
 
     def centres(poses: NDArray) -> NDArray:
         return _centres(reference + poses)
 
     def outline(poses: NDArray) -> NDArray:
-        return _frustum(reference + poses[0], distance)[OUTLINE]
+        return _frustum(reference + poses[0], distance, angles[1])[OUTLINE]
 
     _, answer = _parts(pair)
     _add_trails(figure, pair, centres, (OTHERS, ANSWER), (2, 5))
@@ -302,15 +304,14 @@ def _centres(poses: NDArray) -> NDArray:
     return _standing(camera_to_world(torch.from_numpy(poses))[:, :3, 3].numpy())
 
 
-def _frustum(pose: NDArray, distance: float) -> NDArray:
+def _frustum(pose: NDArray, distance: float, field_of_view: float) -> NDArray:
     """The corners of what a camera sees at a distance, as `image_plane` has them, and its centre: `[5, 3]`."""
     camera = camera_to_world(torch.from_numpy(pose)).numpy()
-    plane = image_plane(camera, distance, math.radians(FIELD_OF_VIEW_DEGREES) / 2)
+    plane = image_plane(camera, distance, field_of_view / 2)
     return _standing(np.vstack([plane, camera[:3, 3]]))
 
 
-def _add_camera(figure: go.Figure, pose: NDArray, image: NDArray, distance: float, colour: str, width: float) -> None:
-    frustum = _frustum(pose, distance)
+def _add_camera(figure: go.Figure, frustum: NDArray, image: NDArray, colour: str, width: float) -> None:
     figure.add_traces([_image(frustum, image), _line(frustum[OUTLINE], colour, width)])
 
 

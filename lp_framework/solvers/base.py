@@ -18,12 +18,14 @@ from lp_framework.keyed_random import keyed_bits
 @dataclass(frozen=True)
 class Pairs:
     """B problems among I images: `images` `[I, 3, H, W]` in [-1, 1] on white, each once; `reference`, `query` `[B]`
-    point to them; `ids` `[B]` are integers that name the pairs for good, to which random draws are keyed."""
+    point to them; `ids` `[B]` are integers that name the pairs for good, to which random draws are keyed. The images'
+    `field_of_view` `[I]` is in radians, on the CPU; None: that of the priors."""
 
     images: Tensor
     reference: Tensor
     query: Tensor
     ids: Tensor
+    field_of_view: Tensor | None = None
 
     def __post_init__(self) -> None:
         _check_images(self.images)
@@ -38,17 +40,18 @@ class Pairs:
 def pairs_of(batch: PairBatch, device: torch.device) -> Pairs:
     """The pairs of a batch, on a device. The batch has images: nothing caches features."""
     batch = move_data_to_device(batch, device)
-    return Pairs(batch.images, batch.reference, batch.query, batch.ids)
+    return Pairs(batch.images, batch.reference, batch.query, batch.ids, batch.field_of_view)
 
 
 @dataclass(frozen=True)
 class ViewSets:
-    """S problems of V >= 2 images each: `images` and `ids` `[S]` are as those of `Pairs`; `views` `[S, V]` point to the
-    images."""
+    """S problems of V >= 2 images each: `images`, `ids` `[S]` and `field_of_view` are as those of `Pairs`; `views`
+    `[S, V]` point to the images."""
 
     images: Tensor
     views: Tensor
     ids: Tensor
+    field_of_view: Tensor | None = None
 
     def __post_init__(self) -> None:
         _check_images(self.images)
@@ -69,7 +72,8 @@ class ViewSets:
         places = torch.tensor([list(reference), list(query)])
         ids = keyed_bits(self.ids[:, None], *places, count=1).to(self.ids.device)
         chosen = self.views[:, places.to(self.views.device)]  # [S, 2, P]
-        return Pairs(self.images, chosen[:, 0].flatten(), chosen[:, 1].flatten(), ids.flatten())
+        ends = chosen[:, 0].flatten(), chosen[:, 1].flatten()
+        return Pairs(self.images, *ends, ids.flatten(), self.field_of_view)
 
 
 def _check_images(images: Tensor) -> None:
@@ -142,6 +146,7 @@ class Solver(ABC):
     """Estimates relative poses. A subclass's constructor declares what it needs by name: `model`, `prior`."""
 
     one_answer = False  # it ignores starts and has one answer a pair: a success rate over starts is none
+    field_of_view_degrees: float | None = None  # of all images, where it was told one
 
     def networks(self) -> list[nn.Module]:
         """The networks that it was given, to be moved to a device."""

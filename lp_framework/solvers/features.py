@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from torch import Tensor, nn
 
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError, check_settings, optional_import
 from lp_framework.geometry import from_opencv, inverse
 from lp_framework.keyed_random import keyed_bits
@@ -34,8 +35,9 @@ class Features(RelativeCameraSolver):
     """Matched local features and their essential matrix; one answer a pair, or none.
 
     The essential matrix is that of PoseLib's LO-RANSAC (keyed by seed and pair), refined on its inliers, for square
-    images. With fewer than `fewest_inliers` of them there is no answer. Where most matches have moved by no more than
-    `tolerance_pixels`, both images are from the same place. The energy is the share of matches that do not fit.
+    images, each with its own field of view or all with `field_of_view_degrees`. With fewer than `fewest_inliers` of
+    them there is no answer. Where most matches have moved by no more than `tolerance_pixels`, both images are from the
+    same place. The energy is the share of matches that do not fit.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class Features(RelativeCameraSolver):
         ratio: float = 0.8,
         tolerance_pixels: float = 1.0,
         fewest_inliers: int = 15,
-        field_of_view_degrees: float = 49.1,
+        field_of_view_degrees: float | None = None,
         reference_radius: float = 1.4,
     ) -> None:
         super().__init__(reference_radius)
@@ -54,7 +56,12 @@ class Features(RelativeCameraSolver):
             ("ratio", ratio, 0 < ratio <= 1, "in (0, 1]"),
             ("tolerance_pixels", tolerance_pixels, tolerance_pixels > 0, "positive"),
             ("fewest_inliers", fewest_inliers, fewest_inliers >= MINIMAL, f"at least {MINIMAL}"),
-            ("field_of_view_degrees", field_of_view_degrees, 0 < field_of_view_degrees < 180, "between 0 and 180"),
+            (
+                "field_of_view_degrees",
+                field_of_view_degrees,
+                field_of_view_degrees is None or 0 < field_of_view_degrees < 180,
+                "between 0 and 180",
+            ),
         )
         if matcher == "sift" and weights is not None:
             raise UserError(f"solver.matcher=sift has no weights, got solver.weights={weights}")
@@ -62,12 +69,13 @@ class Features(RelativeCameraSolver):
         self.matcher = Sift(ratio) if matcher == "sift" else Learned(matcher, weights)
         self.network = self.matcher.network  # where those look who move it to a device
         self.tolerance, self.fewest_inliers = tolerance_pixels, fewest_inliers
-        self.field_of_view = math.radians(field_of_view_degrees)
+        self.field_of_view_degrees = field_of_view_degrees
 
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
         height, width = pairs.images.shape[-2:]
         if height != width:
             raise UserError(f"solver=features takes square images, got {height} x {width} pixels")
+        focal = self.focal_lengths(pairs)
         views = torch.cat([pairs.reference, pairs.query]).unique().tolist()
         seen = {view: self.matcher.describe(pairs.images[view]) for view in views}
         draws = keyed_bits(seed, pairs.ids, count=1)[:, 0] & 0x7FFFFFFF
@@ -76,26 +84,41 @@ class Features(RelativeCameraSolver):
         problems = torch.stack([pairs.reference.cpu(), pairs.query.cpu(), draws], dim=1).tolist()
         for number, (reference, query, draw) in enumerate(problems):
             matches = self.matcher.match(seen[reference], seen[query])
-            found = self.relative_camera(matches, width, draw)
+            found = self.relative_camera(matches, width, (focal[reference], focal[query]), draw)
             if found is not None:
                 cameras[number], energies[number] = torch.from_numpy(found[0]), found[1]
         flip = from_opencv(torch.eye(4, dtype=torch.float64))
         return flip @ from_opencv(cameras), energies, 0 if self.network is None else len(pairs)
 
-    def relative_camera(self, matches: Matches, width: int, seed: int) -> tuple[NDArray[np.float64], float] | None:
+    def focal_lengths(self, pairs: Pairs) -> list[float]:
+        """The focal length of every image, in pixels."""
+        angles = pairs.field_of_view
+        if angles is None or self.field_of_view_degrees is not None:
+            degrees = self.field_of_view_degrees or FIELD_OF_VIEW_DEGREES
+            angles = torch.full((len(pairs.images),), math.radians(degrees), dtype=torch.float64)
+        lengths: list[float] = (pairs.images.shape[-1] / 2 / torch.tan(angles / 2)).tolist()
+        return lengths
+
+    def relative_camera(
+        self, matches: Matches, width: int, focal: tuple[float, float], seed: int
+    ) -> tuple[NDArray[np.float64], float] | None:
         """The query's camera in the reference's frame, `[4, 4]` with OpenCV's axes and a translation of length 1 (0
-        where it has not moved), and the share of matches that do not fit it; None where there are too few."""
+        where it has not moved), and the share of matches that do not fit it; None where there are too few. The `focal`
+        lengths are those of the reference and the query, in pixels."""
         count = len(matches.reference)
         if count < self.fewest_inliers:
             return None
-        moved = np.linalg.norm(matches.query - matches.reference, axis=1)
+        centre = (width - 1) / 2  # (0, 0) is the centre of the first pixel
+        seen = centre + (matches.query - centre) * (focal[0] / focal[1])  # with the reference's focal length
+        moved = np.linalg.norm(seen - matches.reference, axis=1)
         if np.median(moved) <= self.tolerance:
             return np.eye(4), float((moved > self.tolerance).mean())
-        focal = width / 2 / math.tan(self.field_of_view / 2)
-        centre = (width - 1) / 2  # (0, 0) is the centre of the first pixel
-        camera = {"model": "SIMPLE_PINHOLE", "width": width, "height": width, "params": [focal, centre, centre]}
+        cameras = [
+            {"model": "SIMPLE_PINHOLE", "width": width, "height": width, "params": [each, centre, centre]}
+            for each in focal
+        ]
         settings = {"max_epipolar_error": self.tolerance, "seed": seed}
-        pose, report = self.poselib.estimate_relative_pose(matches.reference, matches.query, camera, camera, settings)
+        pose, report = self.poselib.estimate_relative_pose(*matches, *cameras, settings)
         if report["num_inliers"] < self.fewest_inliers:
             return None
         to_query = np.eye(4)

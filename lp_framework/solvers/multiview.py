@@ -78,7 +78,8 @@ class MultiView(Solver):
         """See `Solver.solve`: each pair as a set of two images; one pose a pair, or one a start without first stage."""
         check_starts(pairs, starts)
         began = now(starts.device)
-        view_sets = ViewSets(pairs.images, torch.stack([pairs.reference, pairs.query], dim=1), pairs.ids)
+        views = torch.stack([pairs.reference, pairs.query], dim=1)
+        view_sets = ViewSets(pairs.images, views, pairs.ids, pairs.field_of_view)
         joint = self._solve(view_sets, starts[:, None], seed)
         energies = (joint.energies[..., 0, 1] + joint.energies[..., 1, 0]) / 2
         return Solution(

@@ -205,14 +205,14 @@ def _badge(colour: str) -> dict[str, Any]:
 
 
 class CameraScene(NamedTuple):
-    """One object: images (RGBA) and view poses `[V, 3]`, the reference's first, and their field of view (radians); of
-    each method the predicted view poses `[V - 1, N, 3]` of the others from N starts, and a word on how good they are.
+    """One object: images (RGBA), view poses `[V, 3]` and fields of view `[V]` (radians), the reference's first; of each
+    method the predicted view poses `[V - 1, N, 3]` of the others from N starts, and a word on how good they are.
     """
 
     title: str
     images: Sequence[Image.Image]
     poses: NDArray
-    field_of_view: float
+    field_of_view: NDArray
     predicted: Sequence[NDArray]
     words: Sequence[str]
 
@@ -254,14 +254,14 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
 
 
 def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray) -> None:
-    cameras, half_angle = _cameras(content.poses), content.field_of_view / 2
-    middle = image_plane(cameras[0], float(content.poses[0, 2]), half_angle)
+    cameras, half_angles = _cameras(content.poses), content.field_of_view / 2
+    middle = image_plane(cameras[0], float(content.poses[0, 2]), half_angles[0])
     scene.image(shrunk(content.images[0]), middle, order=10.0)
     drawn = [("true", index, camera, TRUE) for index, camera in enumerate(cameras)]
     drawn += [("predicted", index, camera, PREDICTED) for index, poses in enumerate(predicted, 1)
               for camera in _cameras(poses)]  # fmt: skip
     for kind, index, camera, line in drawn:
-        plane = image_plane(camera, FRUSTUM * scene.radius, half_angle)
+        plane = image_plane(camera, FRUSTUM * scene.radius, half_angles[index])
         order = 20.0 + float(scene.nearness(camera[:3, 3])) if kind == "true" else 30.0
         scene.frustum(camera[:3, 3], plane, color=colour_of(index), zorder=order, gid=kind, **line)
 
