@@ -216,8 +216,16 @@ def test_views_keep_the_true_relative_poses_but_for_up_and_scale(root, tmp_path,
     assert record["viewpoint_quality_score"] == 2.5 and record["point_cloud_quality_score"] == 1.7
 
 
-@pytest.mark.parametrize("cloud", [True, False])
-@pytest.mark.parametrize("kind", ["turned", "elsewhere", "far away"])
+def test_masks_of_zeros_and_ones_mark_the_same_pixels(make, root):
+    name = f"hydrant-{SEQUENCE}"
+    pixels = [mask_pixels(each) for each in make().photographs(name).photographs]
+    for file in (root / "hydrant" / SEQUENCE / "masks").glob("*.png"):
+        Image.fromarray((np.asarray(Image.open(file)) > 0).astype(np.uint8)).save(file)
+    again = [mask_pixels(each) for each in make().photographs(name).photographs]
+    assert len(pixels) == 14 and all(map(np.array_equal, pixels, again))
+
+
+@pytest.mark.parametrize(("kind", "cloud"), [("turned", True), ("elsewhere", False), ("far away", True)])
 def test_one_wrong_camera_is_left_out_by_name_and_changes_no_other_view(make, root, tmp_path, kind, cloud):
     if not cloud:
         (root / CLOUD).unlink()

@@ -476,6 +476,10 @@ def test_masks_are_found_by_name(tmp_path: Path):
         UserError, match=r"x/a\.jpg and y/a\.jpg have the same name, so .* cannot tell their masks apart"
     ):
         mask_files([Path("x/a.jpg"), Path("y/a.jpg")], tmp_path)
+    Image.fromarray(drawn()[..., 3]).save(tmp_path / "b.png")
+    with pytest.raises(UserError, match=r"/b\.png and .*/b\.tif are both masks of photos/b\.jpg$"):
+        mask_files(files, tmp_path)
+    assert mask_files([Path("photos/a.jpg")], tmp_path) == [tmp_path / "a.png"]
 
 
 # ---------------------------------------------------------------- background removal
@@ -581,6 +585,12 @@ def test_an_object_that_the_border_cuts_off_is_told(caplog):
     assert caplog.messages == [
         "cut.png: the image's border seems to cut the object off; an answer wants all of it in the picture"
     ]
+
+
+def test_a_mask_that_is_inverted_is_told(caplog):
+    mask = placed(drawn(80, 60), 20, 40).getchannel("A").point(lambda level: 255 - level)
+    prepare(Image.new("RGB", mask.size), "a", mask)
+    assert caplog.messages == ["a: all of the image's border is the object's; a mask is white where the object is"]
 
 
 # ---------------------------------------------------------------- cut-outs as they are published

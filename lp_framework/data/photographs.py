@@ -74,7 +74,10 @@ def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
         if first.setdefault(file.stem, file) != file:
             both = f"{first[file.stem]} and {file}"
             raise UserError(f"{both} have the same name, so {folder} cannot tell their masks apart")
-    masks = {mask.stem: mask for mask in reversed(_images_in(folder))}
+    masks: dict[str, Path] = {}
+    for mask in _images_in(folder):
+        if masks.setdefault(mask.stem, mask) != mask and mask.stem in first:
+            raise UserError(f"{masks[mask.stem]} and {mask} are both masks of {first[mask.stem]}")
     found = [masks.get(file.stem) for file in files]
     if not any(found):
         raise UserError(_no_mask(files[0], folder))
@@ -111,12 +114,14 @@ def opened(file: str | Path) -> Iterator[Image.Image]:
 
 
 def read_mask(file: str | Path) -> Image.Image:
-    """A mask file with its own levels, turned as its EXIF orientation says (see `masks.mask_opacity`); `UserError`
-    naming the file where it cannot be read."""
-    with opened(file) as mask:
-        turned = ImageOps.exif_transpose(mask)
-        turned.load()
-        return turned
+    """A mask file, turned as its EXIF orientation says: RGB or RGBA, or the numbers that it holds (see
+    `masks.mask_opacity`); `UserError` naming the file where it cannot be read."""
+    with opened(file) as opened_mask:
+        mask = ImageOps.exif_transpose(opened_mask)
+        if mask.mode[0] not in "IF":
+            return mask.convert("RGBA" if mask.has_transparency_data else "RGB")
+        mask.load()
+        return mask
 
 
 def read_image(file: str | Path) -> Image.Image:
@@ -207,7 +212,10 @@ def crop_to_object(image: Image.Image, name: str) -> Image.Image:
     longest = max(right - left, bottom - top)
     if longest < SMALLEST:
         raise UserError(f"{name}: the object is {longest} pixels long, at least {SMALLEST} are needed")
-    if max(int(line.sum()) for line in (opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1])) > CUT_OFF * longest:
+    border = (opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1])
+    if all(line.all() for line in border):
+        log.warning("%s: all of the image's border is the object's; a mask is white where the object is", name)
+    elif max(int(line.sum()) for line in border) > CUT_OFF * longest:
         log.warning(
             "%s: the image's border seems to cut the object off; an answer wants all of it in the picture", name
         )
