@@ -60,10 +60,11 @@ def mask_opacity(mask: Image.Image, name: str) -> Image.Image | None:
     full = 255 if high <= 255 else max(65535, high)
     if low > 0 and (coloured or low == high or 2 * low > full):
         return None
-    if len(levels) > 2 and (coloured or _are_labels(values, levels, full)):
+    if len(levels) != 2 and not coloured and not _are_labels(values, levels, full):
+        return _stretched(values, low, full)
+    if len(levels) > 2:
         warnings.warn(f"{name}: its mask has {len(levels) - 1} labels; all are taken for the object", stacklevel=2)
-        values, low, high = values > low, 0, 1
-    return _stretched(values, low, high if low < high and (len(levels) == 2 or high == 1) else full)
+    return _stretched(values > low, 0, 1)
 
 
 def _levels(mask: Image.Image, name: str) -> tuple[NDArray[Any], bool]:
@@ -84,7 +85,7 @@ def _levels(mask: Image.Image, name: str) -> tuple[NDArray[Any], bool]:
 
 def _are_labels(values: NDArray[Any], levels: NDArray[Any], full: int) -> bool:
     """Whether the levels `[L]` of a grey mask `[H, W]` number things: a soft mask has many, or few in thin edges."""
-    if len(levels) > MOST_LABELS:
+    if not 1 < len(levels) <= MOST_LABELS:
         return False
     dark = levels[2 * levels < full]
     return len(dark) == len(levels) or any(minimum_filter(values == each, THICK).any() for each in dark[1:])
@@ -108,21 +109,13 @@ def without_strays(opacity: Image.Image, name: str) -> Image.Image:
         return opacity
     sizes = np.bincount(parts.ravel(), counts.ravel())
     largest = int(sizes.argmax())
-    boxes = find_objects(parts)
-    rows, columns = boxes[largest - 1]
-    apart = [
-        number
-        for number, (down, across) in enumerate(boxes, start=1)
-        if down.start < rows.start
-        or down.stop > rows.stop
-        or across.start < columns.start
-        or across.stop > columns.stop
-    ]
-    strays = [number for number in apart if sizes[number] < STRAY * sizes[largest]]
+    boxes = np.array([[down.start, across.start, -down.stop, -across.stop] for down, across in find_objects(parts)])
+    apart = 1 + np.nonzero((boxes < boxes[largest - 1]).any(axis=1))[0]
+    strays = apart[sizes[apart] < STRAY * sizes[largest]]
     if len(apart) > len(strays):
         others = f"{len(apart) - len(strays) + 1} separate parts, which are all taken for the object"
         warnings.warn(f"{name}: its mask has {others}", stacklevel=2)
-    if not strays:
+    if not len(strays):
         return opacity
     pixels = f"{int(sizes[strays].sum())} pixels that lie apart from the object; they are left out"
     warnings.warn(f"{name}: its mask has {pixels}", stacklevel=2)
