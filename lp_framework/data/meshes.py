@@ -1,4 +1,4 @@
-"""Meshes: loading any file that trimesh reads, normalising it, and the surfaces that the renderers draw.
+"""Meshes: loading a file, normalising it, and the surfaces that the renderers draw.
 
 Normalised is a scene whose bounding box has its centre at the origin and a longest side of 1 (the paper, Dataset
 Construction).
@@ -7,8 +7,7 @@ Construction).
 from __future__ import annotations
 
 import hashlib
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,6 +21,8 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from lp_framework.data.files import expecting
+from lp_framework.data.images import eight_bit
+from lp_framework.data.mesh_files import LINEAR_COLOUR, MIRROR, REPEAT, WRAP, MissingColourWarning, read_mesh, warn
 from lp_framework.errors import UserError
 
 Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
@@ -29,6 +30,7 @@ Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
 NEUTRAL_GREY = 0.6  # linear reflectance of what has neither texture nor colour
 CREASE_ANGLE = np.radians(40)  # edges that bend less are shaded smooth
 LARGEST_TEXTURE = 2048  # pixels a side; finer detail than the views can show
+UP_AXES = {".glb": "y", ".gltf": "y", ".3mf": "z"}  # of formats whose standard says which axis points up
 
 
 @dataclass(frozen=True)
@@ -64,20 +66,36 @@ class Surface:
     corner_colours: NDArray[np.float32] | None  # [3T, 3]
     texture: NDArray[np.uint8] | None  # [h, w, 3], powers of two, first row on top
     texture_coordinates: NDArray[np.float32] | None  # [3T, 2], v upwards
+    wrap: NDArray[np.int64] | None = (
+        None  # [2], how the texture goes on across and up (OpenGL's numbers); None: repeats
+    )
 
 
-def load_scene(path: Path) -> trimesh.Scene:
-    """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...); warns where part of it has no colour.
+def load_scene(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] = ()) -> trimesh.Scene:
+    """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...), whose axis `up` becomes our +Y.
 
-    Raises `UserError` naming the file when it is missing, does not load, has no faces or has no extent.
+    Textures and materials are looked for beside it and in `folders`. Warns of what is not drawn as the file has it, and
+    where part of it has no colour. Raises `UserError` naming the file when it is missing, does not load, needs what is
+    not supported, has no faces or has no extent.
     """
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
     with expecting(f"{path}: does not load as a mesh"):
-        scene = normalise(trimesh.load_scene(str(path)))
+        scene = read_mesh(path, (path.parent, *folders))
+        if up == "z":
+            scene.apply_transform(np.eye(4)[[1, 2, 0, 3]])  # as `real_cameras.z_up_to_y_up` does it
+        scene = normalise(scene)
+        for mesh in scene.geometry.values():
+            if (image := _image(mesh)) is not None:
+                eight_bit(image)
+    axis = UP_AXES.get(path.suffix.lower(), up)
+    if axis != up:
+        warn(path, f"files of this format have +{axis.upper()} up, data.up={up} is set")
     if plain := sum(not _has_colour(mesh) for mesh in scene.geometry.values()):
         grey = f"{plain} of {len(scene.geometry)} meshes have no texture or colour; they are drawn in light grey"
-        warnings.warn(f"{path}: {grey}", stacklevel=2)
+        warn(path, grey, MissingColourWarning)
+    if any(_image(mesh) is not None and _encoded_colours(mesh) is not None for mesh in scene.geometry.values()):
+        warn(path, "has vertex or face colours beside its texture; the texture is drawn")
     return scene
 
 
@@ -140,6 +158,7 @@ def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.
     image, colour = _image(mesh), _factor(mesh)
     if colour is None:
         colour = np.full(3, 1.0 if _has_colour(mesh) else NEUTRAL_GREY)
+    coordinates, wrap = (None, None) if image is None else _mapping(mesh, corners)
     return Surface(
         positions=mesh.vertices[corners].astype(np.float32),
         normals=_corner_normals(mesh.triangles[faces]),
@@ -147,8 +166,28 @@ def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.
         colour=colour.astype(np.float32),
         corner_colours=_corner_colours(mesh, faces),
         texture=None if image is None else _texture(image),
-        texture_coordinates=None if image is None else np.asarray(mesh.visual.uv, np.float32)[corners],  # type: ignore
+        texture_coordinates=coordinates,
+        wrap=wrap,
     )
+
+
+def _mapping(mesh: trimesh.Trimesh, corners: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64] | None]:
+    """The texture coordinates `[3T, 2]` of corners and how the texture wraps.
+
+    They are 0 in triangles with one that is not finite, of which each renderer would make something else.
+    """
+    coordinates = np.asarray(mesh.visual.uv, np.float32)[corners]  # type: ignore
+    proper = np.isfinite(coordinates).reshape(-1, 6).all(axis=1)
+    coordinates = np.where(np.repeat(proper, 3)[:, None], coordinates, np.float32(0))
+    wrap = np.array(mesh.metadata.get(WRAP, (REPEAT, REPEAT)))
+    for axis in np.flatnonzero(wrap == MIRROR):
+        lowest, highest = coordinates[:, axis].min(), coordinates[:, axis].max()
+        period = np.floor(lowest)
+        if highest <= period + 1:  # it is mirrored nowhere on this surface
+            inside = coordinates[:, axis] - period
+            coordinates[:, axis] = 1 - inside if period % 2 else inside
+            wrap[axis] = REPEAT
+    return coordinates, None if (wrap == REPEAT).all() else wrap
 
 
 def _weld(points: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -182,7 +221,7 @@ def _corner_normals(triangles: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _has_colour(mesh: trimesh.Trimesh) -> bool:
-    coloured = isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind is not None
+    coloured = LINEAR_COLOUR in mesh.vertex_attributes or _encoded_colours(mesh) is not None
     return coloured or _image(mesh) is not None or _factor(mesh) is not None
 
 
@@ -197,32 +236,47 @@ def _image(mesh: trimesh.Trimesh) -> Image.Image | None:
 
 
 def _factor(mesh: trimesh.Trimesh) -> NDArray[np.floating] | None:
-    """The one linear colour `[3]` that the material gives, where the file has one."""
+    """The one linear colour `[3]` that the material gives, where the file has one and does not colour the vertices."""
     match mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None:
         case PBRMaterial(baseColorFactor=factor) if factor is not None:
             return np.asarray(factor, float)[:3] / 255  # glTF: linear
-        case SimpleMaterial(image=None, diffuse=diffuse, kwargs=properties) if "kd" in properties or not np.array_equal(
-            diffuse, SimpleMaterial().diffuse
+        case SimpleMaterial(image=None, diffuse=diffuse, kwargs=properties) if _encoded_colours(mesh) is None and (
+            "kd" in properties or not np.array_equal(diffuse, SimpleMaterial().diffuse)
         ):
             return srgb_to_linear(np.asarray(diffuse, float)[:3] / 255)
     return None
 
 
+def _encoded_colours(mesh: trimesh.Trimesh) -> tuple[str, NDArray[np.uint8]] | None:
+    """What the file colours, "vertex" or "face", and the colours `[V or F, 3 or 4]` in sRGB."""
+    if isinstance(mesh.visual, ColorVisuals):
+        kind = mesh.visual.kind
+        return None if kind is None else (kind, getattr(mesh.visual, f"{kind}_colors"))
+    for kind, attributes in (("vertex", mesh.vertex_attributes), ("face", mesh.face_attributes)):
+        if "color" in attributes:  # where trimesh keeps them beside a material
+            return kind, np.asarray(attributes["color"])
+    return None
+
+
 def _corner_colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[np.float32] | None:
-    """Linear colours `[3T, 3]` from vertex or face colours, which files store in sRGB."""
-    if not isinstance(mesh.visual, ColorVisuals) or mesh.visual.kind is None:
+    """Linear colours `[3T, 3]` from vertex or face colours, which files but glTF's store in sRGB; a texture of another
+    format than glTF shows without them."""
+    corners = mesh.faces[faces].reshape(-1)
+    if LINEAR_COLOUR in mesh.vertex_attributes:
+        linear = np.asarray(mesh.vertex_attributes[LINEAR_COLOUR], np.float32)
+        return np.nan_to_num(linear[corners, :3]).clip(0, 1)
+    encoded = _encoded_colours(mesh)
+    if encoded is None or _image(mesh) is not None:
         return None
-    if mesh.visual.kind == "vertex":
-        colours = mesh.visual.vertex_colors[mesh.faces[faces].reshape(-1)]
-    else:
-        colours = np.repeat(mesh.visual.face_colors[faces], 3, axis=0)
+    kind, levels = encoded
+    colours = levels[corners] if kind == "vertex" else np.repeat(levels[faces], 3, axis=0)
     return srgb_to_linear(colours[:, :3] / 255).astype(np.float32)
 
 
 def _texture(image: Image.Image) -> NDArray[np.uint8]:
     """The image as RGB with sides that are powers of two, so that mip levels halve exactly in every renderer."""
     size = tuple(min(LARGEST_TEXTURE, 2 ** round(np.log2(side))) for side in image.size)
-    colour = image.convert("RGB")
+    colour = eight_bit(image).convert("RGB")
     return np.asarray(colour if colour.size == size else colour.resize(size, Image.Resampling.LANCZOS))
 
 

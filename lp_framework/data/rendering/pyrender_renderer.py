@@ -63,10 +63,13 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
 
     primitives = []
     for surface in parts:
-        texture, coordinates, colours = surface.texture, surface.texture_coordinates, surface.corner_colours
+        coordinates, colours, texture = surface.texture_coordinates, surface.corner_colours, None
+        if surface.texture is not None:
+            sampler = None if surface.wrap is None else pyrender.Sampler(wrapS=surface.wrap[0], wrapT=surface.wrap[1])
+            texture = pyrender.Texture(sampler=sampler, source=surface.texture, source_channels="RGB")
         material = pyrender.MetallicRoughnessMaterial(
             baseColorFactor=[*surface.colour, 1.0],
-            baseColorTexture=None if texture is None else pyrender.Texture(source=texture, source_channels="RGB"),
+            baseColorTexture=texture,
             metallicFactor=0.0,
             roughnessFactor=1.0,
         )

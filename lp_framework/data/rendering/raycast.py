@@ -12,6 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from lp_framework.data.mesh_files import CLAMP, REPEAT
 from lp_framework.data.meshes import Surface, srgb_to_linear, surfaces
 from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, View, downsample
 from lp_framework.errors import optional_import
@@ -71,7 +72,7 @@ class _Part:
         area = np.maximum((self.normal**2).sum(axis=1, keepdims=True), np.finfo(float).tiny)
         self.gradient1 = np.cross(edge2, self.normal) / area
         self.gradient2 = np.cross(self.normal, edge1) / area
-        self.mips = None if surface.texture is None else _Mips(surface.texture)
+        self.mips = None if surface.texture is None else _Mips(surface.texture, surface.wrap)
 
     def seen(
         self, triangle: NDArray[np.int64], rays: NDArray[np.float64], pose: NDArray[np.float64], step: float
@@ -139,7 +140,8 @@ def _shade(
 class _Mips:
     """A texture with its mip levels one after the other in one array of texels, as OpenGL's trilinear filter has it."""
 
-    def __init__(self, texture: NDArray[np.uint8]) -> None:
+    def __init__(self, texture: NDArray[np.uint8], wrap: NDArray[np.int64] | None) -> None:
+        self.wrap = (REPEAT, REPEAT) if wrap is None else wrap  # across and up
         levels = [texture]
         while max(texture.shape[:2]) > 1:
             rows, columns = (2 if side > 1 else 1 for side in texture.shape[:2])
@@ -168,9 +170,19 @@ class _Mips:
         right, down = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
 
         def texel(r: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.float32]:
-            index = self.offsets[level] + (r % height) * width + c % width  # the texture repeats
+            index = self.offsets[level] + _wrapped(r, height, self.wrap[1]) * width + _wrapped(c, width, self.wrap[0])
             return self.texels[index].astype(np.float32) / 255
 
         top = (1 - right) * texel(row, column) + right * texel(row, column + 1)
         bottom = (1 - right) * texel(row + 1, column) + right * texel(row + 1, column + 1)
         return (1 - down) * top + down * bottom
+
+
+def _wrapped(index: NDArray[np.int64], side: NDArray[np.int64], wrap: int) -> NDArray[np.int64]:
+    """Indices of texels within a texture's `side` for those that may lie beyond."""
+    if wrap == CLAMP:
+        return index.clip(0, side - 1)
+    if wrap == REPEAT:
+        return index % side
+    mirrored = index % (2 * side)
+    return np.minimum(mirrored, 2 * side - 1 - mirrored)

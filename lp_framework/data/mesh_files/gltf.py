@@ -1,0 +1,267 @@
+"""glTF, as the standard (2.0) says.
+
+trimesh reads the scene's nodes, its triangles, materials and images, and passes over the rest. That is put into the
+terms that it reads before it sees the file, or refused, or named in a warning; a file without any of it goes through as
+it is.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from trimesh.resolvers import ZipResolver
+from trimesh.visual import TextureVisuals
+
+from lp_framework.data.mesh_files.common import (
+    LINEAR_COLOUR,
+    REPEAT,
+    WRAP,
+    find,
+    readable_image,
+    warn,
+    warn_of_texture,
+)
+from lp_framework.errors import UserError
+
+SUPPORTED = (
+    "KHR_mesh_quantization", "KHR_texture_transform", "EXT_mesh_gpu_instancing", "EXT_texture_webp",
+    "EXT_texture_avif", "MSFT_texture_dds",
+    # These say how light falls on a material, or where lamps are.
+    "KHR_materials_", "KHR_lights_", "EXT_lights_",
+)  # fmt: skip
+COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+UNSIGNED_INT, FLOAT = 5125, 5126
+TRIANGLES, TRIANGLE_FAN = 4, 6
+
+
+def read_gltf(path: Path) -> trimesh.Scene:
+    """The scene of a .gltf or .glb file. A mesh has its vertex colours, if any, in `vertex_attributes[LINEAR_COLOUR]`
+    and how its texture wraps in `metadata[WRAP]`. Raises `UserError` for an extension that is required and unknown."""
+    file = _File(path)
+    file.instances()
+    textures = file.textures()
+    for mesh in file.header.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            file.geometry(primitive)
+            file.colours(primitive)
+            file.texture_coordinates(primitive, textures)
+    file.say_what_is_left_out()
+    scene = file.scene()
+    for mesh in scene.geometry.values():
+        if isinstance(getattr(mesh, "visual", None), TextureVisuals):
+            mesh.metadata[WRAP] = file.wrap(textures.get(int(mesh.visual.material.name)))
+    return scene
+
+
+class _File:
+    """The header of a glTF file and its buffers; its methods rewrite the header, and add to the buffers."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.header, chunk = _parts(path.read_bytes())
+        for extension in self.header.get("extensionsRequired", []):
+            if not extension.startswith(SUPPORTED):
+                raise self._unsupported(extension)
+        self.buffers: list[bytes] = []
+        self.images: dict[int, bytes | None] = {}  # those of textures, by index
+        for buffer in self.header.get("buffers", []):
+            if "uri" not in buffer and "extensions" in buffer:
+                raise self._unsupported(next(iter(buffer["extensions"])))
+            self.buffers.append(self._at(buffer["uri"]) if "uri" in buffer else chunk)
+
+    def scene(self) -> trimesh.Scene:
+        """What trimesh makes of the file now; the name of a material is its index."""
+        files = {f"buffer{index}": buffer for index, buffer in enumerate(self.buffers)}
+        files |= {f"image{index}": image for index, image in self.images.items() if image is not None}
+        for index, buffer in enumerate(self.header.get("buffers", [])):
+            buffer["uri"] = f"buffer{index}"
+        for index, material in enumerate(self.header.get("materials", [])):
+            material["name"] = str(index)
+        for node in self.header.get("nodes", []):
+            node.pop("camera", None)  # trimesh leaves out what lies below
+        # Only those that colour the object are drawn.
+        self.header["images"] = [{"uri": f"image{index}"} for index in range(len(self.header.get("images", [])))]
+        header = io.BytesIO(json.dumps(self.header).encode())
+        return trimesh.load_scene(header, file_type="gltf", resolver=ZipResolver(files))
+
+    def _unsupported(self, extension: str) -> UserError:
+        return UserError(f"{self.path}: needs the glTF extension {extension}, which is not supported; save it without")
+
+    def _at(self, uri: str) -> bytes:
+        if uri.startswith("data:"):
+            return urlopen(uri).read()
+        found = find(uri, [self.path.parent])
+        if found is None:
+            raise UserError(f"{self.path}: its file {uri} is not found")
+        return found.read_bytes()
+
+    # ------------------------------------------------------------ accessors
+
+    def _values(self, index: int) -> NDArray[Any]:
+        """The values `[count, components]` of an accessor; normalized integers become floats."""
+        accessor = self.header["accessors"][index]
+        kind, components = np.dtype(TYPES[accessor["componentType"]]), COMPONENTS[accessor["type"]]
+        values = np.zeros((accessor["count"], components), kind)
+        if "bufferView" in accessor:
+            values[:] = self._view(accessor, kind, *values.shape)
+        if sparse := accessor.get("sparse"):
+            indices, replaced = sparse["indices"], sparse["values"]
+            rows = self._view(indices, np.dtype(TYPES[indices["componentType"]]), sparse["count"], 1)[:, 0]
+            values[rows] = self._view(replaced, kind, sparse["count"], components)
+        return np.maximum(values / np.iinfo(kind).max, -1) if accessor.get("normalized") else values
+
+    def _view(self, place: dict[str, Any], kind: np.dtype[Any], count: int, components: int) -> NDArray[Any]:
+        view = self.header["bufferViews"][place["bufferView"]]
+        start = view.get("byteOffset", 0) + place.get("byteOffset", 0)
+        strides = (view.get("byteStride", components * kind.itemsize), kind.itemsize)
+        return np.ndarray((count, components), kind, self.buffers[view["buffer"]], start, strides)
+
+    def _store(self, values: NDArray[Any]) -> int:
+        """The index of a new accessor with the values `[count, components]`, unsigned integers or else floats."""
+        kind = UNSIGNED_INT if values.dtype.kind == "u" else FLOAT
+        data = np.ascontiguousarray(values, TYPES[kind]).tobytes()
+        accessor = {"componentType": kind, "count": len(values), "type": [*COMPONENTS][values.shape[1] - 1]}
+        for key, item in (
+            ("buffers", {"byteLength": len(data)}),
+            ("bufferViews", {"buffer": len(self.buffers), "byteLength": len(data)}),
+            ("accessors", {"bufferView": len(self.header["bufferViews"]), **accessor}),
+        ):
+            self.header[key].append(item)
+        self.buffers.append(data)
+        return len(self.header["accessors"]) - 1
+
+    # ------------------------------------------------------------ meshes
+
+    def geometry(self, primitive: dict[str, Any]) -> None:
+        """Positions and indices without normalized or sparse accessors, and fans as triangles."""
+        attributes, accessors = primitive["attributes"], self.header["accessors"]
+        if "bufferView" not in accessors[attributes["POSITION"]] and primitive.get("extensions"):
+            raise self._unsupported(next(iter(primitive["extensions"])))
+        primitive.pop("extensions", None)
+        for holder, key in ((attributes, "POSITION"), (primitive, "indices")):
+            if key in holder and {"sparse", "normalized"} & set(accessors[holder[key]]):
+                holder[key] = self._store(self._values(holder[key]))
+        if primitive.get("mode") == TRIANGLE_FAN:
+            around = np.arange(accessors[attributes["POSITION"]]["count"], dtype=np.uint32)
+            if "indices" in primitive:
+                around = self._values(primitive["indices"])[:, 0]
+            fan = np.stack([np.full_like(around[2:], around[0]), around[1:-1], around[2:]], axis=1)
+            primitive |= {"mode": TRIANGLES, "indices": self._store(fan.reshape(-1, 1))}
+
+    def colours(self, primitive: dict[str, Any]) -> None:
+        """Vertex colours as floats in an attribute of our own, for trimesh takes them for sRGB of 8 bits."""
+        if (index := primitive["attributes"].pop("COLOR_0", None)) is not None:
+            colours = self._values(index)
+            if colours.dtype.kind != "f":
+                colours = colours / np.iinfo(colours.dtype).max
+            primitive["attributes"][LINEAR_COLOUR] = self._store(colours)
+
+    def texture_coordinates(self, primitive: dict[str, Any], textures: dict[int, dict[str, Any]]) -> None:
+        """The coordinates of the texture as the first ones, moved by the texture's transform."""
+        texture, attributes = textures.get(primitive.get("material", -1)), primitive["attributes"]
+        transform = {} if texture is None else texture.get("extensions", {}).get("KHR_texture_transform", {})
+        number = 0 if texture is None else transform.get("texCoord", texture.get("texCoord", 0))
+        index = attributes.pop(f"TEXCOORD_{number}", None)
+        if index is None:
+            attributes.pop("TEXCOORD_0", None)
+            return
+        accessor = self.header["accessors"][index]
+        if transform or accessor["componentType"] != FLOAT or "sparse" in accessor:
+            angle, scale = transform.get("rotation", 0.0), transform.get("scale", (1.0, 1.0))
+            # Counter-clockwise as one sees it: v points down.
+            turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+            index = self._store(self._values(index) * scale @ turn.T + transform.get("offset", (0.0, 0.0)))
+        attributes["TEXCOORD_0"] = index
+
+    def instances(self) -> None:
+        """A node of its own for each of the instances of a mesh (EXT_mesh_gpu_instancing)."""
+        for node in [*self.header.get("nodes", [])]:
+            instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+            if instancing is None:
+                continue
+            places = {
+                key.lower(): self._values(index).tolist()
+                for key, index in instancing["attributes"].items()
+                if key in ("TRANSLATION", "ROTATION", "SCALE")
+            }
+            mesh = node.pop("mesh")
+            for place in zip(*places.values(), strict=True):
+                node.setdefault("children", []).append(len(self.header["nodes"]))
+                self.header["nodes"].append({"mesh": mesh, **dict(zip(places, place, strict=True))})
+
+    def say_what_is_left_out(self) -> None:
+        """Warn of what moves vertices and is not applied."""
+        nodes, meshes = self.header.get("nodes", []), self.header.get("meshes", [])
+        if any("skin" in node for node in nodes):
+            warn(self.path, "its skeleton (skins) is left out; it is drawn as its meshes are modelled")
+        if any(any(each.get("weights", [])) for each in (*nodes, *meshes)):
+            warn(self.path, "its morph targets are left out; it is drawn as its meshes are modelled")
+
+    # ------------------------------------------------------------ textures
+
+    def textures(self) -> dict[int, dict[str, Any]]:
+        """By material the reference to the texture that colours it; each texture's source is an image that is read."""
+        found = {}
+        for index, material in enumerate(self.header.get("materials", [])):
+            older = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+            colour = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+            if (texture := colour if older is None else older.get("diffuseTexture")) is not None:
+                found[index] = texture
+        for number in sorted({texture["index"] for texture in found.values()}):
+            self._choose_source(self.header["textures"][number])
+        return found
+
+    def _choose_source(self, texture: dict[str, Any]) -> None:
+        """The first image of a texture that is read, those of its extensions before its own."""
+        named = []
+        for each in (*texture.pop("extensions", {}).values(), {"source": texture.pop("source", None)}):
+            if (source := each.get("source")) is None:
+                continue
+            image = self.header["images"][source]
+            if source not in self.images:
+                self.images[source] = self._image(image)
+            if readable_image(self.images[source]):
+                texture["source"] = source
+                return
+            named.append(image.get("mimeType") if image.get("uri", "data:").startswith("data:") else image["uri"])
+        warn_of_texture(self.path, " or ".join(name or "" for name in named))
+
+    def _image(self, image: dict[str, Any]) -> bytes | None:
+        if "bufferView" in image:
+            view = self.header["bufferViews"][image["bufferView"]]
+            return self._view(image, np.dtype("u1"), view["byteLength"], 1).tobytes()
+        if image["uri"].startswith("data:"):
+            return urlopen(image["uri"]).read()
+        found = find(image["uri"], [self.path.parent])
+        return None if found is None else found.read_bytes()
+
+    def wrap(self, texture: dict[str, Any] | None) -> tuple[int, int]:
+        """How a texture goes on beyond its sides, across and up."""
+        sampler = {} if texture is None else self.header["textures"][texture["index"]]
+        if "sampler" in sampler:
+            sampler = self.header["samplers"][sampler["sampler"]]
+        return sampler.get("wrapS", REPEAT), sampler.get("wrapT", REPEAT)
+
+
+def _parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The header of a .gltf or .glb file, and the binary chunk of a .glb file."""
+    if data[:4] != b"glTF":
+        return json.loads(data.decode("utf-8-sig")), b""
+    chunks = {}
+    version, start = struct.unpack_from("<I", data, 4)[0], 12
+    while start < len(data):
+        length, kind = struct.unpack_from("<I4s", data, start)
+        chunks[kind] = data[start + 8 : start + 8 + length]
+        start += 8 + length
+    if version != 2 or start > len(data):
+        raise ValueError(f"it is cut short, or of version {version} instead of 2")
+    return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")

@@ -1,0 +1,143 @@
+"""Wavefront OBJ with its materials, as other viewers read it.
+
+trimesh reads the geometry. What it passes over is put into terms that it reads: all material files as one, textures
+where they are found, indices that count backwards. The options of a texture are applied to its coordinates.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+from trimesh.visual import TextureVisuals
+
+from lp_framework.data.mesh_files.common import (
+    CLAMP,
+    REPEAT,
+    WRAP,
+    MissingColourWarning,
+    find,
+    load,
+    texture_bytes,
+    warn,
+)
+
+MATERIALS = "materials.mtl"  # what trimesh is given as the one material file
+OPTION = re.compile(  # of a texture, before its name
+    r"-(?P<name>[ost])(?P<numbers>(?:\s+[-+.\deE]+(?=\s)){1,3})\s+|-clamp\s+(?P<clamp>on|off)\s+"
+    r"|-mm\s+\S+\s+\S+\s+|-(?:blendu|blendv|boost|bm|cc|imfchan|texres|type)\s+\S+\s+",
+    re.IGNORECASE,
+)
+
+
+@dataclass
+class Mapping:
+    """How a texture lies on a surface: coordinates times `scale` plus `offset`; clamped at its sides, or repeated."""
+
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    clamped: bool = False
+
+
+def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
+    """The scene of an .obj file, whose material files and textures are looked for in `folders`; a mesh has the wrap of
+    its texture in `metadata[WRAP]`."""
+    text = _read(path)
+    if re.search(r"^f\s.*?[\s/]-\d", text, re.MULTILINE):
+        text = _counting_forwards(text)
+    libraries = _libraries(path, text, folders)
+    used = dict.fromkeys(re.findall(r"^usemtl\s+(.*?)\s*$", text, re.MULTILINE))
+    known = re.findall(r"^\s*newmtl\s+(.*?)\s*$", libraries, re.MULTILINE)
+    if not used and known:  # other viewers take the first
+        used, text = {known[0]: None}, f"usemtl {known[0]}\n{text}"
+    if unknown := [name for name in used if name not in known]:
+        warn(path, f"its material {' and '.join(unknown)} is in none of its material files", MissingColourWarning)
+    materials, mappings, files = _with_textures(path, libraries, used, folders)
+    scene = load("obj", io.StringIO(f"mtllib {MATERIALS}\n{text}"), {MATERIALS: materials, **files})
+    for mesh in scene.geometry.values():
+        if isinstance(mesh.visual, TextureVisuals) and (mapping := mappings.get(mesh.visual.material.name)):
+            mesh.metadata[WRAP] = (CLAMP, CLAMP) if mapping.clamped else (REPEAT, REPEAT)
+            if mesh.visual.uv is not None and mapping != Mapping(clamped=mapping.clamped):
+                mesh.visual.uv = mesh.visual.uv * mapping.scale + mapping.offset
+    return scene
+
+
+def _read(path: Path) -> str:
+    # File names in other encodings pass through as they are.
+    return path.read_text(encoding="utf-8-sig", errors="surrogateescape")
+
+
+def _libraries(path: Path, text: str, folders: Sequence[Path]) -> str:
+    """The material files that a text names, one after the other."""
+    found = []
+    for names in re.findall(r"^mtllib\s+(.*?)\s*$", text, re.MULTILINE):
+        whole = find(names, folders)  # one name with spaces, or several names
+        for name, file in [(names, whole)] if whole else [(name, find(name, folders)) for name in names.split()]:
+            if file is None:
+                warn(path, f"its material file {name} is not there", MissingColourWarning)
+            else:
+                found.append(_read(file))
+    return "\n".join(found)
+
+
+def _with_textures(
+    path: Path, libraries: str, used: dict[str, None], folders: Sequence[Path]
+) -> tuple[str, dict[str, Mapping], dict[str, bytes]]:
+    """The materials with textures called 0, 1, ...; how these are mapped, by material; and their bytes, by name."""
+    lines: list[str] = []
+    mappings: dict[str, Mapping] = {}
+    files: dict[str, bytes] = {}
+    material = ""
+    for line in libraries.splitlines():
+        key, _, value = line.strip().replace("\t", " ").partition(" ")
+        if key.lower() == "newmtl":
+            material = value.strip()
+        elif key.lower() == "map_kd":
+            mapping, name = _options(value)
+            data = texture_bytes(path, name, folders) if material in used else None
+            if data is None:
+                continue
+            mappings[material], line = mapping, f"map_Kd {len(files)}"
+            files[str(len(files))] = data
+        lines.append(line)
+    return "\n".join(lines), mappings, files
+
+
+def _options(value: str) -> tuple[Mapping, str]:
+    """The mapping that the options before a texture's name make, and the name."""
+    value, mapping = value.strip(), Mapping()
+    while option := OPTION.match(value):
+        u, v, *_ = (*map(float, (option["numbers"] or "").split()), None, None)
+        match (option["name"] or "").lower():
+            case "s":
+                mapping.scale = (u, 1.0 if v is None else v)
+            case "o":
+                mapping.offset = (u, 0.0 if v is None else v)
+        if option["clamp"]:
+            mapping.clamped = option["clamp"].lower() == "on"
+        value = value[option.end() :]
+    return mapping, value
+
+
+def _counting_forwards(text: str) -> str:
+    """The text with indices of faces that count back from the lines so far (-1 is the last) as those that count from
+    the first line (1)."""
+    counts = {"v": 0, "vt": 0, "vn": 0}
+    lines = []
+    for line in text.splitlines():
+        kind, *words = line.split() or [""]
+        if kind in counts:
+            counts[kind] += 1
+        elif kind == "f":
+            corners = [zip(word.split("/"), counts.values(), strict=False) for word in words]
+            forwards = (
+                "/".join(str(int(index) + 1 + count) if index.startswith("-") else index for index, count in corner)
+                for corner in corners
+            )
+            line = " ".join(("f", *forwards))
+        lines.append(line)
+    return "\n".join(lines)
