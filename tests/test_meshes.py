@@ -19,6 +19,7 @@ from lp_framework.data.meshes import (
     srgb_to_linear,
     surfaces,
 )
+from lp_framework.data.sets.rendered import MeshData
 from lp_framework.errors import UserError
 
 
@@ -126,6 +127,17 @@ def test_textured_objects_load_with_their_colours(tmp_path, write_object):
     for surface in surfaces(scene):
         norms = np.linalg.norm(surface.normals, axis=1)
         assert np.isfinite(norms).all() and (norms > 0.99).mean() > 0.99
+
+
+@pytest.mark.parametrize("suffix", ["obj", "glb"])
+def test_the_axis_that_points_up_can_be_chosen(tmp_path, suffix):
+    trimesh.creation.box(bounds=[[0, 0, 0], [1, 2, 4]]).export(tmp_path / f"box.{suffix}")
+    for up, extents in (("y", [0.25, 0.5, 1]), ("z", [0.5, 1, 0.25])):  # x, y, z become our Z, X, Y
+        (obj,) = MeshData(None, str(tmp_path), up=up).objects()
+        with pytest.warns(UserWarning) as caught:
+            np.testing.assert_allclose(obj.load().extents, extents, atol=1e-6)
+        said = [each for each in caught if "files of this format have +Y up, data.up=z is set" in str(each.message)]
+        assert len(said) == (suffix == "glb" and up == "z")
 
 
 # ---------------------------------------------------------------- colours

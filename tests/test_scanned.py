@@ -96,9 +96,26 @@ def test_damaged_objects(tmp_path):
     (root / GSO[0] / "materials" / "textures" / "texture.png").unlink()
     (root / GSO[1] / "meshes" / "model.obj").write_text("nothing\n")
     (root / GSO[2] / "meshes" / "model.obj").unlink()
-    for name, message in zip(GSO, ["texture.png: there is no", "model.obj: ", "model.obj: there is no"], strict=False):
+    messages = ["its texture texture.png is not there", "model.obj: ", "model.obj: there is no"]
+    for name, message in zip(GSO, messages, strict=False):
         with pytest.raises(UserError, match=message):
             load_gso(root / name / "meshes" / "model.obj")
+
+
+@pytest.mark.parametrize(
+    ("write", "data", "missing", "message"),
+    [
+        (write_gso, GSOData, "meshes/model.mtl", "model.obj: its material file model.mtl is not there"),
+        (write_oo3d, OO3DData, "Scan/Scan.mtl", "Scan.obj: its material file Scan.mtl is not there"),
+        (write_oo3d, OO3DData, "Scan/Scan.jpg", "Scan.obj: its texture Scan.jpg is not there"),
+    ],
+)
+def test_scans_without_their_material_are_not_rendered(write, data, missing, message, tmp_path):
+    root = write(tmp_path / "scans", "cup_001")
+    next(root.glob(f"**/{missing}")).unlink()
+    (obj,) = data(None, str(root), views=str(tmp_path / "views"), seen=1, unseen=0).objects()
+    with pytest.raises(UserError, match=message):
+        obj.load()
 
 
 def test_rendering_objects_as_released(tmp_path):

@@ -6,23 +6,21 @@ trained on. Where iFusion's renderings are at hand (`renderings`), the seen obje
 
 from __future__ import annotations
 
-import io
 import warnings
 from abc import abstractmethod
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import trimesh
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
-from trimesh.resolvers import ZipResolver
 
 from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below
-from lp_framework.data.meshes import MeshObject, load_scene, normalise
+from lp_framework.data.mesh_files import MissingColourWarning
+from lp_framework.data.meshes import MeshObject, load_scene
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
 from lp_framework.data.toy import toy_objects
@@ -133,10 +131,9 @@ class MeshData(RenderedData):
     """A folder of meshes, in any formats that trimesh reads; rendered into `views`.
 
     `unseen` of its objects are kept from training; `objects` says whether these or the others are in use. `labels` is
-    a YAML file with their ambiguity classes (see `read_labels`).
+    a YAML file with their ambiguity classes (see `read_labels`). The axis `up` of the files becomes our +Y.
     """
 
-    load = staticmethod(load_scene)
     seen: int | None = None  # how many there are to train on, all but the unseen ones by default
     renderings: Path | None = None  # a folder of views of those to train on, which are drawn by default
 
@@ -146,6 +143,7 @@ class MeshData(RenderedData):
         path: str,
         views: str | None = None,
         labels: str | None = None,
+        up: Literal["y", "z"] = "y",
         unseen: int = 0,
         objects: Literal["seen", "unseen"] = "seen",
         split_seed: int = 0,
@@ -158,7 +156,7 @@ class MeshData(RenderedData):
         workers: int | None = None,
     ) -> None:
         self.meshes, self.labels = Path(path), None if labels is None else Path(labels)
-        self.unseen, self.which, self.split_seed = unseen, objects, split_seed
+        self.up, self.unseen, self.which, self.split_seed = up, unseen, objects, split_seed
         super().__init__(
             renderer, views or f"datasets/{self.meshes.resolve().name}", workers, resolution=resolution,
             test_views=test_views, train_views=train_views, latitude_step_degrees=latitude_step_degrees,
@@ -198,8 +196,12 @@ class MeshData(RenderedData):
         """The mesh of an object."""
         return self._files.get(name, self.meshes / name)
 
+    def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
+        """What loads a mesh."""
+        return partial(load_scene, file, self.up)
+
     def _object(self, name: str) -> MeshObject:
-        load, label = partial(self.load, self.file(name)), self._labels.get(name)
+        load, label = self.loader(self.file(name)), self._labels.get(name)
         if label is None:
             return MeshObject(name, "unlabelled", load)
         return MeshObject(name, label.ambiguity, load, label.unique_answer)
@@ -246,7 +248,7 @@ class ScannedData(MeshData):
         workers: int | None = None,
     ) -> None:
         super().__init__(
-            renderer, path, views or f"datasets/{self.release}", None, unseen, objects, split_seed, resolution,
+            renderer, path, views or f"datasets/{self.release}", None, "y", unseen, objects, split_seed, resolution,
             test_views, train_views, latitude_step_degrees, longitude_step_degrees, depth, workers,
         )  # fmt: skip
         self.seen, self.renderings = seen, None if renderings is None else Path(renderings)
@@ -261,16 +263,17 @@ class ScannedData(MeshData):
         return names_below(self.meshes, sound, self.what, self.meshes / pattern)
 
 
+def load_scan(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] = ()) -> trimesh.Scene:
+    """`load_scene` of a scan, whose material and texture must be there; `UserError` where they are not."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MissingColourWarning)
+        return load_scene(path, up, folders)
+
+
 def load_gso(path: Path) -> trimesh.Scene:
-    """The normalised scene of an object of GSO, turned from +Z up to +Y up; `UserError` naming a file that is missing
-    or does not load."""
-    texture = path.parents[1] / "materials" / "textures" / "texture.png"
-    with expecting(f"{path}: does not load as a mesh"), path.open("rb") as opened:
-        # The material names its texture without the folder.
-        files = {file.name: io.BytesIO(file.read_bytes()) for file in (*path.parent.glob("*.mtl"), texture)}
-        scene = trimesh.load_scene(opened, file_type="obj", resolver=ZipResolver(files))
-        scene.apply_transform(np.eye(4)[[1, 2, 0, 3]])  # as `real_cameras.z_up_to_y_up` does it
-        return normalise(scene)
+    """The normalised scene of an object of GSO, turned from +Z up to +Y up; its material names its texture without the
+    folder."""
+    return load_scan(path, "z", [path.parents[1] / "materials" / "textures"])
 
 
 @register("data", "gso")
@@ -278,7 +281,9 @@ class GSOData(ScannedData):
     """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
 
     release, what, layout = "gso", "objects of GSO", "{name}/meshes/model.obj"
-    load = staticmethod(load_gso)
+
+    def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
+        return partial(load_gso, file)
 
 
 @register("data", "oo3d")
@@ -286,3 +291,6 @@ class OO3DData(ScannedData):
     """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
 
     release, what, layout = "oo3d", "scans of OmniObject3D", "{category}/{name}/Scan/Scan.obj"
+
+    def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
+        return partial(load_scan, file)
