@@ -23,6 +23,7 @@ from odd_meshes import (
     picture,
     write_obj,
 )
+from PIL import Image
 
 from lp_framework.data.meshes import load_scene, srgb_to_linear, surfaces
 from lp_framework.data.rendering.pyrender_renderer import PyrenderRenderer, offscreen_context
@@ -121,6 +122,12 @@ def test_a_texture_beside_vertex_colours_of_obj_is_drawn_without_them(tmp_path, 
     scene, messages = load(write_obj(tmp_path, f"mtllib a.mtl\n{COLOURED_SQUARE}"))
     assert np.abs(view(scene) - plain_view).max() <= 2
     assert len(messages) == 1 and "odd.obj: has vertex or face colours beside its texture" in messages[0]
+
+
+def test_vertices_without_a_colour_among_coloured_ones_are_white(tmp_path):
+    path = tmp_path / "odd.obj"
+    path.write_text("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 0 0 1\nf 1 2 3\n")
+    np.testing.assert_array_equal(the_surface(path).corner_colours, [[1, 0, 0], [1, 1, 1], [0, 0, 1]])
 
 
 def test_vertices_in_one_place_keep_their_own_colours(tmp_path):
@@ -234,9 +241,40 @@ def broken_image(folder: Path) -> Path:
     return path
 
 
+def material(**settings):
+    def write(folder: Path) -> Path:
+        file = Gltf(image=encoded(picture().convert("RGBA")))
+        file.material |= settings
+        return file.write(folder)
+
+    return write
+
+
+def faded(folder: Path) -> Path:
+    file = Gltf(image=encoded(Image.merge("RGBA", (*picture().split(), Image.new("L", (16, 16), 99)))))
+    file.material["alphaMode"] = "BLEND"
+    return file.write(folder)
+
+
+def moved_by(**settings):
+    def write(folder: Path) -> Path:
+        file = Gltf()
+        file.node |= settings
+        return file.write(folder)
+
+    return write
+
+
 @pytest.mark.parametrize(
     ("write", "message"),
     [
+        (faded, "not drawn of its materials: transparency"),
+        (material(emissiveFactor=[0, 1, 0]), "not drawn of its materials: light of their own"),
+        (lambda folder: Gltf(uv=None).write(folder), "not drawn of its materials: textures (it has no coordinates"),
+        (lambda folder: write_obj(folder, mtl="newmtl m\nd .5\nmap_Kd tex.png\n"), "of its materials: transparency"),
+        (lambda folder: write_obj(folder, mtl="newmtl m\nKe 0 1 0\nmap_Kd tex.png\n"), "materials: light of their own"),
+        (moved_by(skin=0), "its skeleton (skins) is left out"),
+        (moved_by(weights=[0.0, 0.5]), "its morph targets are left out"),
         (texture_uri("gone.png"), "its texture gone.png is not there or not a readable image"),
         (only_ktx2, "its texture image/ktx2 is not there or not a readable image"),
         (lambda folder: write_obj(folder, mtl="newmtl m\nmap_Kd gone.png\n"), "its texture gone.png is not there"),
@@ -259,6 +297,24 @@ def test_several_textures_of_a_ply_file_are_refused(tmp_path):
     path = ply_texture("comment TextureFile a.png\ncomment TextureFile b.png\n")(tmp_path)
     with pytest.raises(UserError, match=f"^{path}: has 2 textures, one is read"):
         load_scene(path)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        ODD["plain"],
+        material(alphaMode="BLEND"),
+        lambda folder: write_obj(folder, mtl="newmtl m\nKe 0 0 0\nd 1\nTr 0\nmap_Kd tex.png\n"),
+    ],
+)
+def test_nothing_is_said_of_materials_that_are_drawn(write, tmp_path):
+    assert load(write(tmp_path))[1] == []
+
+
+def test_archives_are_refused(tmp_path):
+    (tmp_path / "odd.zip").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"odd\.zip: is an archive; unpack it"):
+        load_scene(tmp_path / "odd.zip")
 
 
 def test_textures_of_floating_point_numbers_are_refused(tmp_path):

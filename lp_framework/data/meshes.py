@@ -7,6 +7,7 @@ Construction).
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,14 +81,12 @@ def load_scene(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] 
     """
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
-    with expecting(f"{path}: does not load as a mesh"):
+    with expecting(f"{path}: does not load as a mesh"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # of large textures
         scene = read_mesh(path, (path.parent, *folders))
         if up == "z":
             scene.apply_transform(np.eye(4)[[1, 2, 0, 3]])  # as `real_cameras.z_up_to_y_up` does it
         scene = normalise(scene)
-        for mesh in scene.geometry.values():
-            if (image := _image(mesh)) is not None:
-                eight_bit(image)
     axis = UP_AXES.get(path.suffix.lower(), up)
     if axis != up:
         warn(path, f"files of this format have +{axis.upper()} up, data.up={up} is set")

@@ -11,11 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from lp_framework.data.images import eight_bit
 from lp_framework.data.mesh_files.common import CLAMP, LINEAR_COLOUR, MIRROR, REPEAT, WRAP, MissingColourWarning, warn
 from lp_framework.data.mesh_files.gltf import read_gltf
 from lp_framework.data.mesh_files.obj import read_obj
 from lp_framework.data.mesh_files.ply import read_ply
+from lp_framework.errors import UserError
 
 __all__ = ["CLAMP", "LINEAR_COLOUR", "MIRROR", "REPEAT", "WRAP", "MissingColourWarning", "read_mesh", "warn"]
 
@@ -32,11 +35,15 @@ def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
             scene = read_obj(path, folders)
         case ".ply":
             scene = read_ply(path, folders)
+        case ".zip" | ".gz" | ".bz2":
+            raise UserError(f"{path}: is an archive; unpack it, and give the folder of the meshes in it")
         case _:
             scene = trimesh.load_scene(str(path), process=False)
-    for mesh in scene.geometry.values():
-        if isinstance(mesh, trimesh.Trimesh):
-            _mend(path, mesh)
+    meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh)]
+    for mesh in meshes:
+        _mend(path, mesh)
+    if left_out := sorted(set().union(*map(_left_out, meshes))):
+        warn(path, f"not drawn of its materials: {', '.join(left_out)}")
     return scene
 
 
@@ -45,7 +52,7 @@ def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
     faces = len(mesh.faces)
     if not np.isfinite(mesh.vertices).all():
         mesh.remove_infinite_values()
-    if lost := faces - len(mesh.faces):
+    if (lost := faces - len(mesh.faces)) and len(mesh.faces):
         warn(path, f"{lost} of {faces} triangles have corners at infinity or nowhere (NaN); they are left out")
     uv = getattr(mesh.visual, "uv", None)
     if uv is not None and (lost := (~np.isfinite(uv[mesh.faces])).any(axis=(1, 2)).sum()):
@@ -55,3 +62,26 @@ def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
     if path.suffix.lower() not in (".gltf", ".glb") and not coloured:
         with np.errstate(invalid="ignore"):  # texture coordinates that are not numbers
             mesh.process()
+
+
+def _left_out(mesh: trimesh.Trimesh) -> set[str]:
+    """What a material asks for that no renderer draws. `ValueError` for a texture that none can."""
+    material = getattr(mesh.visual, "material", None)
+    if isinstance(material, PBRMaterial):
+        image, factor, light = material.baseColorTexture, material.baseColorFactor, material.emissiveFactor
+        clear = material.alphaMode in ("MASK", "BLEND") and (
+            (factor is not None and factor[3] < 255)
+            or (image is not None and image.convert("RGBA").getextrema()[3][0] < 255)
+        )
+    elif isinstance(material, SimpleMaterial):
+        image, light = material.image, [float(level) for level in material.kwargs.get("ke", [])]
+        opacity, transparency = (float(material.kwargs.get(key, [number])[-1]) for key, number in (("d", 1), ("tr", 0)))
+        clear = opacity < 1 or transparency > 0 or "map_d" in material.kwargs
+    else:
+        return set()
+    if image is not None:
+        eight_bit(image)
+    unmapped = image is not None and getattr(mesh.visual, "uv", None) is None
+    shines = light is not None and np.any(light)
+    found = {"transparency": clear, "light of their own": shines, "textures (it has no coordinates for them)": unmapped}
+    return {what for what, is_so in found.items() if is_so}

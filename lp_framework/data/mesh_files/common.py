@@ -38,7 +38,7 @@ def warn(path: Path, what: str, category: type[UserWarning] = UserWarning) -> No
 def find(name: str, folders: Iterable[Path]) -> Path | None:
     """The file that `name` in a mesh file means: below one of `folders`, as it is written, with backslashes, with `%20`
     for a space, in other letter case, or, as the last resort, beside the mesh wherever the name puts it."""
-    spellings = [spelling.replace("\\", "/") for spelling in (name, unquote(name))]
+    spellings = [spelling.strip('"').replace("\\", "/") for spelling in (name, unquote(name))]
     for spelling in (*spellings, *(spelling.rpartition("/")[2] for spelling in spellings)):
         for folder in folders:
             if (found := _in_any_case(folder, spelling)) is not None:

@@ -37,6 +37,7 @@ SUPPORTED = (
     # These say how light falls on a material, or where lamps are.
     "KHR_materials_", "KHR_lights_", "EXT_lights_",
 )  # fmt: skip
+COLOUR_TEXTURES = ("baseColorTexture", "diffuseTexture")
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 UNSIGNED_INT, FLOAT = 5125, 5126
@@ -210,13 +211,18 @@ class _File:
 
     def textures(self) -> dict[int, dict[str, Any]]:
         """By material the reference to the texture that colours it; each texture's source is an image that is read."""
-        found = {}
+        found, wanted = {}, set()
         for index, material in enumerate(self.header.get("materials", [])):
-            older = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
-            colour = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-            if (texture := colour if older is None else older.get("diffuseTexture")) is not None:
-                found[index] = texture
-        for number in sorted({texture["index"] for texture in found.values()}):
+            colours = material.get("pbrMetallicRoughness", {})
+            colours = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", colours)
+            for key in COLOUR_TEXTURES:
+                if key in colours:
+                    found[index] = colours[key]
+            # trimesh makes the colour of the older kind of material from both of its textures.
+            wanted |= {
+                colours[key]["index"] for key in (*COLOUR_TEXTURES, "specularGlossinessTexture") if key in colours
+            }
+        for number in sorted(wanted):
             self._choose_source(self.header["textures"][number])
         return found
 

@@ -47,14 +47,16 @@ def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     """The scene of an .obj file, whose material files and textures are looked for in `folders`; a mesh has the wrap of
     its texture in `metadata[WRAP]`."""
     text = _read(path)
-    if re.search(r"^f\s.*?[\s/]-\d", text, re.MULTILINE):
+    if re.search(r"^f[ \t].*?[ \t/]-\d", text, re.MULTILINE):
         text = _counting_forwards(text)
-    libraries = _libraries(path, text, folders)
-    used = dict.fromkeys(re.findall(r"^usemtl\s+(.*?)\s*$", text, re.MULTILINE))
-    known = re.findall(r"^\s*newmtl\s+(.*?)\s*$", libraries, re.MULTILINE)
+    if re.search(r"^v(?:[ \t]+\S+){6}", text, re.MULTILINE):  # trimesh wants a colour at every vertex
+        text = re.sub(r"^(v(?:[ \t]+[^\s#]+){3})[ \t]*$", r"\1 1 1 1", text, flags=re.MULTILINE)
+    libraries, whole = _libraries(path, text, folders)
+    used = dict.fromkeys(re.findall(r"^usemtl[ \t]+(.*?)[ \t]*$", text, re.MULTILINE))
+    known = re.findall(r"^[ \t]*newmtl[ \t]+(.*?)[ \t]*$", libraries, re.MULTILINE | re.IGNORECASE)
     if not used and known:  # other viewers take the first
         used, text = {known[0]: None}, f"usemtl {known[0]}\n{text}"
-    if unknown := [name for name in used if name not in known]:
+    if whole and (unknown := [name for name in used if name not in known]):
         warn(path, f"its material {' and '.join(unknown)} is in none of its material files", MissingColourWarning)
     materials, mappings, files = _with_textures(path, libraries, used, folders)
     scene = load("obj", io.StringIO(f"mtllib {MATERIALS}\n{text}"), {MATERIALS: materials, **files})
@@ -71,17 +73,19 @@ def _read(path: Path) -> str:
     return path.read_text(encoding="utf-8-sig", errors="surrogateescape")
 
 
-def _libraries(path: Path, text: str, folders: Sequence[Path]) -> str:
-    """The material files that a text names, one after the other."""
-    found = []
-    for names in re.findall(r"^mtllib\s+(.*?)\s*$", text, re.MULTILINE):
-        whole = find(names, folders)  # one name with spaces, or several names
-        for name, file in [(names, whole)] if whole else [(name, find(name, folders)) for name in names.split()]:
+def _libraries(path: Path, text: str, folders: Sequence[Path]) -> tuple[str, bool]:
+    """The material files that a text names, one after the other, and whether all are there; warns of those that are
+    not."""
+    found, whole = [], True
+    for names in re.findall(r"^mtllib[ \t]+(.*?)[ \t]*$", text, re.MULTILINE):
+        one = find(names, folders)  # one name with spaces, or several names
+        for name, file in [(names, one)] if one else [(name, find(name, folders)) for name in names.split()]:
             if file is None:
+                whole = False
                 warn(path, f"its material file {name} is not there", MissingColourWarning)
             else:
                 found.append(_read(file))
-    return "\n".join(found)
+    return "\n".join(found), whole
 
 
 def _with_textures(
