@@ -77,7 +77,10 @@ class _File:
         for buffer in self.header.get("buffers", []):
             if "uri" not in buffer and "extensions" in buffer:
                 raise self._unsupported(next(iter(buffer["extensions"])))
-            self.buffers.append(self._at(buffer["uri"]) if "uri" in buffer else chunk)
+            data = self._named(buffer["uri"]) if "uri" in buffer else chunk
+            if data is None:
+                raise UserError(f"{path}: its file {buffer['uri']} is not there")
+            self.buffers.append(data)
 
     def scene(self) -> trimesh.Scene:
         """What trimesh makes of the file now; the name of a material is its index."""
@@ -97,13 +100,11 @@ class _File:
     def _unsupported(self, extension: str) -> UserError:
         return UserError(f"{self.path}: needs the glTF extension {extension}, which is not supported; save it without")
 
-    def _at(self, uri: str) -> bytes:
+    def _named(self, uri: str) -> bytes | None:
         if uri.startswith("data:"):
             return urlopen(uri).read()
         found = find(uri, [self.path.parent])
-        if found is None:
-            raise UserError(f"{self.path}: its file {uri} is not found")
-        return found.read_bytes()
+        return None if found is None else found.read_bytes()
 
     # ------------------------------------------------------------ accessors
 
@@ -145,9 +146,9 @@ class _File:
     def geometry(self, primitive: dict[str, Any]) -> None:
         """Positions and indices without normalized or sparse accessors, and fans as triangles."""
         attributes, accessors = primitive["attributes"], self.header["accessors"]
-        if "bufferView" not in accessors[attributes["POSITION"]] and primitive.get("extensions"):
-            raise self._unsupported(next(iter(primitive["extensions"])))
-        primitive.pop("extensions", None)
+        compressed = [name for name in primitive.pop("extensions", {}) if not name.startswith(SUPPORTED)]
+        if compressed and not {"bufferView", "sparse"} & set(accessors[attributes["POSITION"]]):
+            raise self._unsupported(compressed[0])
         for holder, key in ((attributes, "POSITION"), (primitive, "indices")):
             if key in holder and {"sparse", "normalized"} & set(accessors[holder[key]]):
                 holder[key] = self._store(self._values(holder[key]))
@@ -238,17 +239,15 @@ class _File:
             if readable_image(self.images[source]):
                 texture["source"] = source
                 return
-            named.append(image.get("mimeType") if image.get("uri", "data:").startswith("data:") else image["uri"])
-        warn_of_texture(self.path, " or ".join(name or "" for name in named))
+            uri = image.get("uri", "data:")
+            named.append(image.get("mimeType", f"number {source}") if uri.startswith("data:") else uri)
+        warn_of_texture(self.path, " or ".join(named) or "without an image")
 
     def _image(self, image: dict[str, Any]) -> bytes | None:
         if "bufferView" in image:
             view = self.header["bufferViews"][image["bufferView"]]
             return self._view(image, np.dtype("u1"), view["byteLength"], 1).tobytes()
-        if image["uri"].startswith("data:"):
-            return urlopen(image["uri"]).read()
-        found = find(image["uri"], [self.path.parent])
-        return None if found is None else found.read_bytes()
+        return self._named(image["uri"])
 
     def wrap(self, texture: dict[str, Any] | None) -> tuple[int, int]:
         """How a texture goes on beyond its sides, across and up."""
@@ -263,8 +262,8 @@ def _parts(data: bytes) -> tuple[dict[str, Any], bytes]:
     if data[:4] != b"glTF":
         return json.loads(data.decode("utf-8-sig")), b""
     chunks = {}
-    version, start = struct.unpack_from("<I", data, 4)[0], 12
-    while start < len(data):
+    (version, end), start = struct.unpack_from("<II", data, 4), 12
+    while start < end:
         length, kind = struct.unpack_from("<I4s", data, start)
         chunks[kind] = data[start + 8 : start + 8 + length]
         start += 8 + length
