@@ -246,6 +246,16 @@ def below_a_camera(folder: Path) -> Path:
 
 
 @odd
+def beside_what_is_hidden(folder: Path) -> Path:
+    file = Gltf()
+    hidden = {"extensions": {"KHR_node_visibility": {"visible": False}}, "children": [2], "mesh": 0, "scale": [2, 2, 2]}
+    file.header["nodes"] = [file.node, hidden, {"mesh": 0, "translation": [3, 0, 0]}]
+    file.header["scenes"] = [{"nodes": [0, 1]}]
+    file.header["extensionsRequired"] = ["KHR_node_visibility"]
+    return file.write(folder)
+
+
+@odd
 def webp(folder: Path) -> Path:
     file = Gltf(image=encoded(picture(), "WEBP"))
     file.header["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
@@ -324,6 +334,16 @@ def obj_folder_above(folder: Path) -> Path:
     for file in (path, folder / "a.mtl"):
         file.rename(below / file.name)
     return below / path.name
+
+
+@odd
+def obj_texture_beside_its_material_file(folder: Path) -> Path:
+    path = write_obj(folder, f"mtllib materials\\A.mtl\n{SQUARE}")
+    below = folder / "materials"
+    below.mkdir()
+    for name in ("a.mtl", "tex.png"):
+        (folder / name).rename(below / name)
+    return path
 
 
 @odd
@@ -461,6 +481,11 @@ OTHER["coloured_texture"] = coloured(np.uint8)
 def coordinates_that_are_not_numbers(folder: Path) -> Path:
     """One triangle of two."""
     return write_obj(folder, f"mtllib a.mtl\n{SQUARE.replace('vt 1 0', 'vt nan 0')}")
+
+
+@other
+def coordinates_without_end(folder: Path) -> Path:
+    return write_obj(folder, f"mtllib a.mtl\n{SQUARE.replace('vt 1 0', 'vt 1e30 -inf')}")
 
 
 @other

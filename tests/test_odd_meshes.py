@@ -284,6 +284,7 @@ def moved_by(**settings):
         (ply_texture("comment TextureFile gone.png\n"), "its texture gone.png is not there"),
         (ply_texture(""), "1 of 1 meshes have no texture or colour"),
         (OTHER["coordinates_that_are_not_numbers"], "1 of 2 triangles have no proper texture coordinates"),
+        (OTHER["coordinates_without_end"], "1 of 2 triangles have no proper texture coordinates"),
         (OTHER["one_corner_nowhere"], "1 of 2 triangles have corners at infinity or nowhere"),
     ],
 )  # fmt: skip

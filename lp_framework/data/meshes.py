@@ -23,7 +23,16 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from lp_framework.data.files import expecting
 from lp_framework.data.images import eight_bit
-from lp_framework.data.mesh_files import LINEAR_COLOUR, MIRROR, REPEAT, WRAP, MissingColourWarning, read_mesh, warn
+from lp_framework.data.mesh_files import read_mesh
+from lp_framework.data.mesh_files.common import (
+    FARTHEST,
+    LINEAR_COLOUR,
+    MIRROR,
+    REPEAT,
+    WRAP,
+    MissingColourWarning,
+    warn,
+)
 from lp_framework.errors import UserError
 
 Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
@@ -173,10 +182,10 @@ def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.
 def _mapping(mesh: trimesh.Trimesh, corners: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64] | None]:
     """The texture coordinates `[3T, 2]` of corners and how the texture wraps.
 
-    They are 0 in triangles with one that is not finite, of which each renderer would make something else.
+    They are 0 in triangles with one that is no proper number, of which each renderer would make something else.
     """
     coordinates = np.asarray(mesh.visual.uv, np.float32)[corners]  # type: ignore
-    proper = np.isfinite(coordinates).reshape(-1, 6).all(axis=1)
+    proper = (np.abs(coordinates) < FARTHEST).reshape(-1, 6).all(axis=1)
     coordinates = np.where(np.repeat(proper, 3)[:, None], coordinates, np.float32(0))
     wrap = np.array(mesh.metadata.get(WRAP, (REPEAT, REPEAT)))
     for axis in np.flatnonzero(wrap == MIRROR):

@@ -14,13 +14,11 @@ import trimesh
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from lp_framework.data.images import eight_bit
-from lp_framework.data.mesh_files.common import CLAMP, LINEAR_COLOUR, MIRROR, REPEAT, WRAP, MissingColourWarning, warn
+from lp_framework.data.mesh_files.common import FARTHEST, warn
 from lp_framework.data.mesh_files.gltf import read_gltf
 from lp_framework.data.mesh_files.obj import read_obj
 from lp_framework.data.mesh_files.ply import read_ply
 from lp_framework.errors import UserError
-
-__all__ = ["CLAMP", "LINEAR_COLOUR", "MIRROR", "REPEAT", "WRAP", "MissingColourWarning", "read_mesh", "warn"]
 
 
 def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
@@ -55,7 +53,7 @@ def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
     if (lost := faces - len(mesh.faces)) and len(mesh.faces):
         warn(path, f"{lost} of {faces} triangles have corners at infinity or nowhere (NaN); they are left out")
     uv = getattr(mesh.visual, "uv", None)
-    if uv is not None and (lost := (~np.isfinite(uv[mesh.faces])).any(axis=(1, 2)).sum()):
+    if uv is not None and (lost := (~(np.abs(uv[mesh.faces]) < FARTHEST)).any(axis=(1, 2)).sum()):
         warn(path, f"{lost} of {faces} triangles have no proper texture coordinates; they show the texture's corner")
     # glTF's vertices are distinct by its standard, others where their colours are.
     coloured = getattr(mesh.visual, "kind", None) == "vertex" or "color" in mesh.vertex_attributes

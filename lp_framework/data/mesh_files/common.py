@@ -22,6 +22,7 @@ from lp_framework.errors import UserError
 
 LINEAR_COLOUR = "_LINEAR_COLOUR"  # a vertex attribute of trimesh: linear colours [V, 3 | 4] in [0, 1]
 WRAP = "wrap"  # in a mesh's metadata: how its texture goes on beyond its sides, across and up
+FARTHEST = 1e6  # texture coordinates beyond say nothing in single precision
 REPEAT, CLAMP, MIRROR = 10497, 33071, 33648  # OpenGL's numbers, which glTF has too
 
 

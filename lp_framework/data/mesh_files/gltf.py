@@ -33,7 +33,7 @@ from lp_framework.errors import UserError
 
 SUPPORTED = (
     "KHR_mesh_quantization", "KHR_texture_transform", "EXT_mesh_gpu_instancing", "EXT_texture_webp",
-    "EXT_texture_avif", "MSFT_texture_dds",
+    "EXT_texture_avif", "MSFT_texture_dds", "KHR_node_visibility",
     # These say how light falls on a material, or where lamps are.
     "KHR_materials_", "KHR_lights_", "EXT_lights_",
 )  # fmt: skip
@@ -92,6 +92,9 @@ class _File:
             material["name"] = str(index)
         for node in self.header.get("nodes", []):
             node.pop("camera", None)  # trimesh leaves out what lies below
+            if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
+                node.pop("mesh", None)
+                node.pop("children", None)
         # Only those that colour the object are drawn.
         self.header["images"] = [{"uri": f"image{index}"} for index in range(len(self.header.get("images", [])))]
         header = io.BytesIO(json.dumps(self.header).encode())

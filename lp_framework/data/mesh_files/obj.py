@@ -51,14 +51,16 @@ def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
         text = _counting_forwards(text)
     if re.search(r"^v(?:[ \t]+\S+){6}", text, re.MULTILINE):  # trimesh wants a colour at every vertex
         text = re.sub(r"^(v(?:[ \t]+[^\s#]+){3})[ \t]*$", r"\1 1 1 1", text, flags=re.MULTILINE)
-    libraries, whole = _libraries(path, text, folders)
+    libraries = _libraries(path, text, folders)
+    read = {file: _read(file) for file in libraries if file is not None}
     used = dict.fromkeys(re.findall(r"^usemtl[ \t]+(.*?)[ \t]*$", text, re.MULTILINE))
-    known = re.findall(r"^[ \t]*newmtl[ \t]+(.*?)[ \t]*$", libraries, re.MULTILINE | re.IGNORECASE)
+    newmtl = re.compile(r"^[ \t]*newmtl[ \t]+(.*?)[ \t]*$", re.MULTILINE | re.IGNORECASE)
+    known = [name for library in read.values() for name in newmtl.findall(library)]
     if not used and known:  # other viewers take the first
         used, text = {known[0]: None}, f"usemtl {known[0]}\n{text}"
-    if whole and (unknown := [name for name in used if name not in known]):
+    if None not in libraries and (unknown := [name for name in used if name not in known]):
         warn(path, f"its material {' and '.join(unknown)} is in none of its material files", MissingColourWarning)
-    materials, mappings, files = _with_textures(path, libraries, used, folders)
+    materials, mappings, files = _with_textures(path, read, used, folders)
     scene = load("obj", io.StringIO(f"mtllib {MATERIALS}\n{text}"), {MATERIALS: materials, **files})
     for mesh in scene.geometry.values():
         if isinstance(mesh.visual, TextureVisuals) and (mapping := mappings.get(mesh.visual.material.name)):
@@ -73,36 +75,33 @@ def _read(path: Path) -> str:
     return path.read_text(encoding="utf-8-sig", errors="surrogateescape")
 
 
-def _libraries(path: Path, text: str, folders: Sequence[Path]) -> tuple[str, bool]:
-    """The material files that a text names, one after the other, and whether all are there; warns of those that are
-    not."""
-    found, whole = [], True
+def _libraries(path: Path, text: str, folders: Sequence[Path]) -> list[Path | None]:
+    """The material files that a text names; None, after a warning, for one that is not there."""
+    found = []
     for names in re.findall(r"^mtllib[ \t]+(.*?)[ \t]*$", text, re.MULTILINE):
         one = find(names, folders)  # one name with spaces, or several names
         for name, file in [(names, one)] if one else [(name, find(name, folders)) for name in names.split()]:
+            found.append(file)
             if file is None:
-                whole = False
                 warn(path, f"its material file {name} is not there", MissingColourWarning)
-            else:
-                found.append(_read(file))
-    return "\n".join(found), whole
+    return found
 
 
 def _with_textures(
-    path: Path, libraries: str, used: dict[str, None], folders: Sequence[Path]
+    path: Path, libraries: dict[Path, str], used: dict[str, None], folders: Sequence[Path]
 ) -> tuple[str, dict[str, Mapping], dict[str, bytes]]:
-    """The materials with textures called 0, 1, ...; how these are mapped, by material; and their bytes, by name."""
+    """The materials of all files, with textures called 0, 1, ...; how they map these; and the textures' bytes."""
     lines: list[str] = []
     mappings: dict[str, Mapping] = {}
     files: dict[str, bytes] = {}
     material = ""
-    for line in libraries.splitlines():
+    for folder, line in ((file.parent, line) for file, text in libraries.items() for line in text.splitlines()):
         key, _, value = line.strip().replace("\t", " ").partition(" ")
         if key.lower() == "newmtl":
             material = value.strip()
         elif key.lower() == "map_kd":
             mapping, name = _options(value)
-            data = texture_bytes(path, name, folders) if material in used else None
+            data = texture_bytes(path, name, (folder, *folders)) if material in used else None
             if data is None:
                 continue
             mappings[material], line = mapping, f"map_Kd {len(files)}"

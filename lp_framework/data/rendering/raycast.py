@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from lp_framework.data.mesh_files import CLAMP, REPEAT
+from lp_framework.data.mesh_files.common import CLAMP, REPEAT
 from lp_framework.data.meshes import Surface, srgb_to_linear, surfaces
 from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING, Renderer, View, downsample
 from lp_framework.errors import optional_import

@@ -19,7 +19,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below
-from lp_framework.data.mesh_files import MissingColourWarning
+from lp_framework.data.mesh_files.common import MissingColourWarning
 from lp_framework.data.meshes import MeshObject, load_scene
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
