@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
-from lp_framework.atomic import written
+from lp_framework.atomic import DiskFull, written
+from lp_framework.errors import UserError
 
 
 def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
@@ -17,11 +20,23 @@ def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"] and file.read_text() == "new"
 
 
-@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
-def test_a_file_that_cannot_be_finished_stays_as_it_was(error: type[BaseException], tmp_path: Path):
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (RuntimeError("bug"), "bug"),
+        (KeyboardInterrupt("stop"), "stop"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+         r"a\.txt: cannot be written \(No space left on device, \d+\.\d MB are free\)"),
+        (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)), r"a\.txt: cannot be written \(Disk quota exceeded\)"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), r"a\.txt: cannot be written \(Permission denied\)"),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_finished_stays_as_it_was(error: BaseException, told: str, tmp_path: Path):
     file = tmp_path / "a.txt"
     file.write_text("old")
-    with pytest.raises(error), written(file) as partial:
+    full = isinstance(error, OSError) and error.errno != errno.EACCES
+    kind = DiskFull if full else UserError if isinstance(error, OSError) else type(error)
+    with pytest.raises(kind, match=told), written(file) as partial:
         partial.write_text("half a")
         raise error
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"] and file.read_text() == "old"

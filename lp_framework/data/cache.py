@@ -21,6 +21,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
+from lp_framework.atomic import reason
 from lp_framework.data.photographs import on_white, opened, prepare
 from lp_framework.data.views import DEPTH_UNIT
 from lp_framework.errors import UserError
@@ -38,7 +39,8 @@ def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], 
             if not _intact(folder, key, count):
                 _write(folder, key, count, blocks())
     except OSError as error:
-        raise UserError(f"{folder}: the cache cannot be written ({error.strerror}); set data.cache=FOLDER") from error
+        why = reason(error, folder)
+        raise UserError(f"{folder}: the cache cannot be written ({why}); set data.cache=FOLDER") from error
     return np.load(folder / f"{key}.npy", mmap_mode="r")
 
 

@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from filelock import FileLock
-from safetensors import SafetensorError
 from torch import Tensor
 
-from lp_framework.atomic import written
+from lp_framework.atomic import writing, written
 from lp_framework.errors import UserError
 from lp_framework.geometry import is_rotation, spherical_residual
 
@@ -80,15 +79,6 @@ def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:
     if not residual <= LARGEST_RESIDUAL:
         off = f"it is {residual:.1f} degrees off, {LARGEST_RESIDUAL:g} are allowed"
         raise UserError(f"{where} does not look at the origin with {up} up ({off})")
-
-
-@contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """Make a `UserError` that names `folder` of what goes wrong in writing into it."""
-    try:
-        yield
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{folder}: cannot be written ({getattr(error, 'strerror', error)})") from error
 
 
 @contextmanager
