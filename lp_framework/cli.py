@@ -66,7 +66,7 @@ def main() -> int:
         if full_error:
             raise
         print(f"error: {' '.join(str(error).splitlines())}", file=sys.stderr)
-        return 1 if type(error) is UserError else 2
+        return error.status
     return 0
 
 

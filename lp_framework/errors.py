@@ -11,6 +11,8 @@ from types import ModuleType
 class UserError(ValueError):
     """Bad input, told in one sentence: what is wrong, where it is, what would be right."""
 
+    status = 1  # the exit status of a command
+
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """`"; did you mean 'x'?"` for the known name closest to `name`, or an empty string when none is close.

@@ -24,6 +24,7 @@ from yaml import YAMLError
 from lp_framework import catalogue, registry
 from lp_framework.errors import UserError, nearest, one_line
 from lp_framework.overrides import with_paths_as_text
+from lp_framework.run_folders import HYDRA, Held, held, relative, remove_if_empty
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +52,8 @@ OF_NO_USE = (
 class UsageError(UserError):
     """A command line that makes no sense."""
 
+    status = 2
+
 
 def run(command: str, arguments: Sequence[str]) -> None:
     """Compose `conf/COMMAND.yaml` with the arguments, and call `lp_framework.commands.COMMAND.run(config)` with it.
@@ -70,6 +73,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     if options["config_name"] is None:
         options["multirun"] |= _check_experiment(command, overrides) and not (options["cfg"] or options["info"])
     failed: list[UserError] = []
+    overrides += _in_resumed_folder(overrides)
     with _restored():
         sys.argv = [sys.argv[0], *overrides, *_as_words(options)]
         os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions are passed on instead of printed
@@ -92,6 +96,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
     def task(config: DictConfig) -> None:
         job = HydraConfig.get()
         sweep = job.mode == RunMode.MULTIRUN
+        folder = Path(job.runtime.output_dir)
         registry.discover(catalogue.plugin_folders(job.overrides.task))
         with _restored():  # the next job would take what Lightning leaves of this one's processes for its own
             # The command line that starts this job alone: Lightning runs it for its other processes.
@@ -101,15 +106,23 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             try:
                 _check_paths(config)  # before what computes is imported, which takes seconds
                 module = importlib.import_module(f"lp_framework.commands.{command}")
-                with _orderly_console():
+                with _orderly_console(), held(relative(Path(config.get("resume") or folder))):
                     module.run(config)
             except (UserError, errors.MissingMandatoryValue, errors.InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
+                if sweep and isinstance(error, Held):
+                    print(f"skipped, another command is at work on it: {relative(folder)}")
+                    return
+                if not isinstance(error, Held):
+                    remove_if_empty(folder, f"{job.job.name}.log")
                 if sweep:
                     log.error("job %s (%s): %s", job.job.num, ", ".join(job.overrides.task), mistake)
                     raise mistake from error
                 log.info("stopped: %s", mistake)  # for the log; the console gets it from the caller
                 failed.append(mistake)
+            except (KeyboardInterrupt, SystemExit):
+                remove_if_empty(folder, f"{job.job.name}.log")
+                raise
             except Exception as error:
                 log.log(logging.ERROR if sweep else logging.INFO, "%s failed", command, exc_info=True)
                 error.raised_by_a_command = True  # type: ignore[attr-defined]  # also after a launcher has pickled it
@@ -142,6 +155,15 @@ def _check_paths(config: DictConfig) -> None:
     of_the_user = registry.MISSING in catalogue.read(f"data/{config.data.name}").settings.get("path", [""])[0]
     if of_the_user and not Path(config.data.path).exists():
         raise UserError(f"data.path={config.data.path}: there is no such folder")
+
+
+def _in_resumed_folder(overrides: Sequence[str]) -> list[str]:
+    """Overrides by which a resumed run goes on in its own folder with its log; Hydra's record there stays as it is."""
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key == "resume" and (Path(value.strip("'\"")) / HYDRA).is_dir():
+            return ["hydra.run.dir=${resume}", "hydra.output_subdir=null"]
+    return []
 
 
 def _leave_processes() -> None:

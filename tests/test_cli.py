@@ -207,11 +207,21 @@ def test_a_saved_config_holds_names_and_numbers_only(lp, jobs, walker):
     assert "_target_" not in text and "tmp_walker" not in text and "!!" not in text
 
 
-def test_bad_input_met_while_running_is_one_sentence_and_in_the_log(lp, jobs, walker):
+def test_bad_input_met_while_running_is_one_sentence_and_leaves_no_folder_with_nothing_in_it(lp, jobs, walker):
     finished = lp(*DEMO, "solver.gamma=2")
     assert finished.status == 1 and finished.error == "gamma is 2, it must not exceed 1"
-    (folder,) = (walker / "runs" / "demo").iterdir()
-    assert "gamma is 2, it must not exceed 1" in (folder / "train.log").read_text()
+    assert list((walker / "runs" / "demo").iterdir()) == []
+    (walker / "mine").mkdir()
+    (walker / "mine" / "notes.txt").write_text("precious")
+    lp(*DEMO, "solver.gamma=2", "hydra.run.dir=mine")
+    assert (walker / "mine" / "notes.txt").exists()
+    assert "gamma is 2, it must not exceed 1" in (walker / "mine" / "train.log").read_text()
+
+
+def test_commands_that_begin_in_one_second_have_folders_of_their_own(lp, jobs, walker):
+    for _ in range(5):
+        lp(*DEMO)
+    assert len(list((walker / "runs" / "demo").iterdir())) == 5
 
 
 def test_a_bug_keeps_its_traceback(lp, jobs, walker):

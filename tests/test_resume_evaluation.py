@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -15,6 +17,7 @@ import pytest
 import torch
 from tiny_runs import OBJECTS, Commands, Ran
 
+from lp_framework.atomic import written
 from lp_framework.commands.building import weights_fingerprint
 from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
@@ -159,6 +162,38 @@ def test_a_run_stopped_before_its_tables_were_written_writes_them(commands, whol
     assert went_on(ran) == PAIRS
     assert ran.err == ""
     assert_the_same(ran, whole)
+
+
+@pytest.mark.parametrize("place", ["journal", "tables", "pictures"])
+def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, monkeypatch, place):
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def no_room_for_pictures(folder: Path, *arguments: object) -> None:
+        folder.mkdir()
+        with written(folder / "errors.png") as partial:
+            partial.write_bytes(b"half")
+            full()
+
+    name = f"full_{place}"
+    with monkeypatch.context() as patch:
+        if place == "journal":
+            sync, room = os.fsync, iter(range(3))
+            patch.setattr(os, "fsync", lambda file: sync(file) if next(room, None) is not None else full())
+        elif place == "tables":
+            replace = os.replace
+            patch.setattr(os, "replace", lambda a, b: full() if b.name == "pairs.csv" else replace(a, b))
+        else:
+            patch.setattr("lp_framework.commands.eval.save_pictures", no_room_for_pictures)
+        ran = commands.here(name, "eval", *EVALUATION, f"pictures={str(place == 'pictures').lower()}")
+    file = {"journal": "unfinished/rank_0.jsonl", "tables": "pairs.csv", "pictures": "pictures/errors.png"}[place]
+    said = rf"{name}/{file}: cannot be written \(No space left on device, [\d.]+ MB are free\)"
+    assert re.fullmatch(f"{said}; make room, then resume={name} goes on", ran.error)
+    again = commands.here("unused", "eval", f"resume={name}", "pictures=false")
+    assert went_on(again) == (4 * BATCH if place == "journal" else PAIRS)
+    again.folder = commands.folder / name
+    assert_the_same(again, whole)
+    assert not (commands.folder / "unused").exists()
 
 
 def test_sets_of_views_go_on(commands, stop):

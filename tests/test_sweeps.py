@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from tiny_runs import Commands, Ran
 
 from lp_framework.report.paper import paper_tables
+from lp_framework.run_folders import held
 
 pytestmark = pytest.mark.heavy
 ROOT = Path(__file__).parents[1]
@@ -135,6 +136,17 @@ def test_a_sweep_goes_on_with_the_jobs_that_have_no_result(sweep):
     for number in "012":
         assert result(sweep.folder / number)["metrics"] == whole[number]["metrics"]
     assert (sweep.folder / "0" / "results.json").stat().st_mtime_ns == when["0"]
+
+
+def test_a_sweep_that_is_started_twice_is_shared(sweep):
+    (sweep.folder / "1").mkdir(parents=True)
+    with held(sweep.folder / "1"):  # by the other
+        ran = sweep("seed=0,1,2")
+    assert ran.status == 0, ran.err
+    assert f"skipped, another command is at work on it: {sweep.folder.name}/1" in ran.out.splitlines()
+    assert [(sweep.folder / number / "results.json").is_file() for number in "012"] == [True, False, True]
+    again = sweep("seed=0,1,2")
+    assert again.out.count("skipped, finished before: ") == 2 and (sweep.folder / "1" / "results.json").is_file()
 
 
 def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(sweep):

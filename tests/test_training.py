@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import os
 import re
 import shutil
@@ -15,11 +16,14 @@ from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from omegaconf import OmegaConf
 from tiny_runs import Commands, Ran
 
+from lp_framework.commands.train import MetricsLogger
 from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import SHIPPED, find_checkpoint, latest_checkpoint, load_model, read_checkpoint
+from lp_framework.run_folders import held
 
 EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6")
 
@@ -206,9 +210,107 @@ def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
     assert (commands.folder / "prolonged" / "training.json").is_file()
 
 
+@pytest.mark.parametrize("written_by", ["this version", "an earlier one"])
+def test_the_best_epoch_of_a_run_that_was_moved_stays_the_best(commands, score, written_by):
+    moved = commands.folder / f"moved by {written_by}"
+    shutil.copytree(score.folder, moved)
+    best, last = moved / "checkpoints" / "best.ckpt", moved / "checkpoints" / "last.ckpt"
+    checkpoint = torch.load(last, weights_only=True)
+    (key,) = (key for key in checkpoint["callbacks"] if "val/loss" in key)
+    state = checkpoint["callbacks"][key]
+    assert str(commands.folder) not in str(checkpoint["callbacks"])
+    here = "" if written_by == "this version" else "/an/earlier/place/checkpoints/"
+    unbeatable = torch.tensor(-1.0)
+    checkpoint["callbacks"][key] = state | {
+        "dirpath": here, "best_model_path": f"{here}best.ckpt", "kth_best_model_path": f"{here}best.ckpt",
+        "best_model_score": unbeatable, "kth_value": unbeatable, "best_k_models": {f"{here}best.ckpt": unbeatable},
+    }  # fmt: skip
+    torch.save(checkpoint, last)
+    before = best.read_bytes()
+    ran = commands.here("unused", "train", f"resume='{moved.name}'", "trainer.max_epochs=4")
+    assert ran.status == 0 and ran.err == "", ran.err
+    assert best.read_bytes() == before
+    after = torch.load(last, weights_only=True)
+    assert after["epoch"] == 3 and after["callbacks"][key]["best_model_score"] == unbeatable
+
+
+def test_a_run_that_goes_on_does_so_in_its_own_folder_alone(commands, score):
+    folder = shutil.copytree(score.folder, commands.folder / "logged")
+    hydra = (folder / ".hydra" / "overrides.yaml").read_text()
+    log = (folder / "train.log").read_text()
+    assert commands.here("unused", "train", "resume=logged", "trainer.max_epochs=4").status == 0
+    assert (folder / "train.log").read_text().startswith(log) and (folder / "train.log").read_text() != log
+    assert (folder / ".hydra" / "overrides.yaml").read_text() == hydra
+    assert not (commands.folder / "unused").exists()
+
+
+def test_a_second_training_in_a_folder_is_told_so_and_touches_nothing(commands, score):
+    folder = shutil.copytree(score.folder, commands.folder / "held")
+    weights = (folder / "checkpoints" / "last.ckpt").read_bytes()
+    with held(folder):
+        for overrides in ((), ("resume=held", "trainer.max_epochs=4")):
+            ran = commands.here("held", "train", *overrides)
+            assert ran.error == "held: another command works in this folder; let it finish, or choose another"
+    assert (folder / "checkpoints" / "last.ckpt").read_bytes() == weights
+    assert commands.here("unused", "train", "resume=held", "trainer.max_epochs=4").status == 0
+
+
+def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_on(commands, score, monkeypatch):
+    write, room = Path.write_bytes, [3]
+
+    def write_while_there_is_room(path: Path, content: bytes) -> int:
+        if ".ckpt" in path.name:
+            if room[0] == 0:
+                write(path, bytes(content)[: len(content) // 2])
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            room[0] -= 1
+        return write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", write_while_there_is_room)
+        ran = commands.here("filled", "train")
+    folder = commands.folder / "filled"
+    assert re.fullmatch(
+        r"filled/checkpoints/(best|last)\.ckpt: cannot be written \(No space left on device, [\d.]+ MB are free\); "
+        r"make room, then resume=filled goes on",
+        ran.error,
+    )
+    assert sorted(each.name for each in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+    assert all("epoch" in read_checkpoint(file) for file in (folder / "checkpoints").iterdir())
+    assert all(None not in row.values() for row in rows(folder)) and rows(folder)
+    assert commands.here("unused", "train", "resume=filled").status == 0
+    for name in ("last.ckpt", "best.ckpt"):
+        found = torch.load(folder / "checkpoints" / name, weights_only=True)
+        assert_equal(found["state_dict"], score.checkpoint(name)["state_dict"])
+    losses = [[row["val/loss"] for row in rows(each) if row["val/loss"]] for each in (folder, score.folder)]
+    assert losses[0] == losses[1]
+
+
+def test_metrics_are_whole_where_the_disk_fills_up(tmp_path, monkeypatch):
+    logger, save = MetricsLogger(tmp_path, name="", version=""), ExperimentWriter.save
+    logger.log_metrics({"train/loss": 1.0}, step=0)
+    logger.save()
+    logger.log_metrics({"train/loss": 0.5, "val/loss": 0.7}, step=1)  # a new column, for which Lightning begins anew
+
+    def half(writer: ExperimentWriter) -> None:
+        Path(writer.metrics_file_path).write_text("train/lo")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch, pytest.raises(UserError, match=r"metrics\.csv: cannot be written \(No space"):
+        patch.setattr(ExperimentWriter, "save", half)
+        logger.save()
+    assert [row["train/loss"] for row in rows(tmp_path)] == ["1.0"]
+    logger.finalize("failed")
+    assert ExperimentWriter.save is save
+    assert [(row["step"], row["train/loss"], row["val/loss"]) for row in rows(tmp_path)] == [
+        ("0", "1.0", ""), ("1", "0.5", "0.7"),
+    ]  # fmt: skip
+    assert [each.name for each in tmp_path.iterdir()] == ["metrics.csv"]
+
+
 @pytest.mark.parametrize("cut", ["shortened", "missing"])
 def test_a_last_checkpoint_cut_short_gives_way_to_the_best(commands, score, cut):
-    """A kill while a checkpoint is written, where temporary files and runs lie on different disks."""
+    """What a power cut may leave, or an earlier version of lp_framework."""
     folder = shutil.copytree(score.folder, commands.folder / cut)
     last = folder / "checkpoints" / "last.ckpt"
     contents = last.read_bytes()

@@ -7,7 +7,8 @@ import importlib.metadata
 import logging
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,12 @@ from torch import nn
 
 from lp_framework import registry
 from lp_framework.api import TINY_KNOWS, best_device
+from lp_framework.atomic import DiskFull
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.views import ViewSource
 from lp_framework.errors import UserError, one_line
-from lp_framework.models.checkpoints import describe, find_checkpoint, load_model
+from lp_framework.models.checkpoints import WholeCheckpointIO, describe, find_checkpoint, load_model
+from lp_framework.run_folders import relative
 
 log = logging.getLogger(__name__)
 
@@ -136,6 +139,7 @@ def build_trainer(
             default_root_dir=folder,
             callbacks=callbacks,
             logger=logger,
+            plugins=[WholeCheckpointIO()],
             use_distributed_sampler=False,  # the data module's samplers know the processes
         )
     except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
@@ -146,7 +150,18 @@ def run_folder() -> Path:
     """The folder of this run, made if need be; relative to the working directory where it lies below it."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+    return relative(folder)
+
+
+@contextmanager
+def resumable(folder: Path, kept: str) -> Iterator[None]:
+    """Say of a full disk how the run in `folder` goes on, where its folder `kept` has anything of it."""
+    try:
+        yield
+    except DiskFull as error:
+        if not any((folder / kept).glob("*")):
+            raise
+        raise DiskFull(f"{error}; make room, then resume={folder} goes on") from error
 
 
 def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[str, ...], saved: Path) -> DictConfig:

@@ -73,7 +73,8 @@ def run(config: DictConfig) -> None:
         raise UserError(f"protocol={protocol} is for pairs; views={views} has a protocol of its own, leave it out")
     else:
         data.evaluate_on_sets(views, batch_pairs)
-    trainer.test(evaluation, datamodule=data, verbose=False)
+    with building.resumable(folder, journal.FOLDER):
+        trainer.test(evaluation, datamodule=data, verbose=False)
     evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather
     result = {
         **evaluation.metrics.compute(),
@@ -88,13 +89,14 @@ def run(config: DictConfig) -> None:
         result["versions_before"] = before["versions"]  # of what was solved before it was stopped
     if trainer.is_global_zero:
         result["breakdown"] = breakdown(evaluation.metrics.rows(), evaluation.table)
-        write_result(folder, result, evaluation.metrics, evaluation.table)
+        with building.resumable(folder, journal.FOLDER):
+            write_result(folder, result, evaluation.metrics, evaluation.table)
+            pictures = []
+            if settings["pictures"]:
+                shown = data.data(data.evaluation_split())
+                pictures = save_pictures(folder / "pictures", evaluation, shown, result)
+            print_results(folder, result, pictures)
         kept.finish()
-        pictures = []
-        if settings["pictures"]:
-            shown = data.data(data.evaluation_split())
-            pictures = save_pictures(folder / "pictures", evaluation, shown, result)
-        print_results(folder, result, pictures)
 
 
 def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | None) -> bool:
@@ -125,9 +127,9 @@ def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | No
 
 def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig, Path | None]:
     """The config and the checkpoint of the stopped `eval` in `folder`; `UserError` where there is none."""
-    if (folder / RESULT).is_file():
-        raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
     subject = journal.unfinished(folder)
+    if subject is None and (folder / RESULT).is_file():
+        raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
     if subject is None:
         raise UserError(f"resume={folder}: holds no {journal.FOLDER} evaluation to go on from; give the folder of one")
     previous = OmegaConf.create(subject["config"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import shlex
+import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,16 +16,18 @@ from hydra.types import RunMode
 from lightning import Trainer
 from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from yaml import YAMLError
 
 from lp_framework import catalogue, registry
+from lp_framework.atomic import written
 from lp_framework.commands import building
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
-from lp_framework.models.checkpoints import BEST, FOLDER, LAST, read_checkpoint
+from lp_framework.models.checkpoints import BEST, FOLDER, LAST, ModelCheckpoint, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.report.page import write_run_page
 from lp_framework.viz.curves import save_training_picture
@@ -74,7 +77,7 @@ def run(config: DictConfig) -> None:
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
     data.carry(*model.carries)
-    loggers: list[Logger] = [CSVLogger(folder, name="", version="")]  # `METRICS` in the run's folder
+    loggers: list[Logger] = [MetricsLogger(folder, name="", version="")]
     if config.logger.tensorboard:
         loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))
     trainer = building.build_trainer(building.plain(config.trainer), folder, chosen_callbacks(config, folder), loggers)
@@ -82,7 +85,8 @@ def run(config: DictConfig) -> None:
         write_text(saved, OmegaConf.to_yaml(config))
         if checkpoint is not None:
             keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
-    trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
+    with building.resumable(folder, FOLDER):
+        trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
     if trainer.is_global_zero:
         report(trainer, folder, config, recipe, data)
 
@@ -132,9 +136,7 @@ def chosen_callbacks(config: DictConfig, folder: Path) -> list[callbacks.Callbac
     for file, monitor, mode in ((BEST, "val/loss" if validated else None, "min"), (LAST, "epoch", "max")):
         named: dict[str, Any] = {"filename": Path(file).stem, "monitor": monitor, "mode": mode}
         chosen.append(
-            callbacks.ModelCheckpoint(
-                folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True
-            )
+            ModelCheckpoint(folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True)
         )
     return chosen
 
@@ -153,6 +155,22 @@ def next_command(recipe: Mapping[str, Any], folder: str, data: Mapping[str, Any]
     return " ".join(["python -m lp_framework eval", f"checkpoint={folder}", *chosen, *changed])
 
 
+class MetricsLogger(CSVLogger):
+    """Lightning's, whose file, `METRICS` in the run's folder, is whole at any moment."""
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Write the file with the rows that came since as another, which takes its place."""
+        file, writer = Path(self.log_dir) / METRICS, self.experiment
+        if not writer.metrics:
+            return
+        with written(file) as partial:
+            if file.is_file():
+                shutil.copyfile(file, partial)
+            writer.metrics_file_path = str(partial)
+            super().save()
+
+
 def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
     """Keep the rows of a run that goes on, up to its checkpoint's step: Lightning would begin the file anew."""
     if not file.is_file():
@@ -161,8 +179,10 @@ def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
         reader = csv.DictReader(content)
         rows = [list(row.values()) for row in reader if row["step"] and int(row["step"]) < steps]
     columns = list(reader.fieldnames or ())
-    writer = next(logger for logger in trainer.loggers if isinstance(logger, CSVLogger)).experiment
-    write_csv(file, columns, rows)
+    logger = next(each for each in trainer.loggers if isinstance(each, MetricsLogger))
+    with written(file) as partial:
+        write_csv(partial, columns, rows)
+        writer = logger.experiment  # removes `file`
     writer.metrics_keys = columns
 
 

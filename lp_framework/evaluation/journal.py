@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lp_framework.atomic import writing
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import SolvedBatch
 from lp_framework.evaluation.tables import RESULT, write_text
@@ -57,7 +58,8 @@ class Journal:
         values = {name: each.tolist() if isinstance(each, torch.Tensor) else each for name, each in fields}
         text = json.dumps(values, separators=(",", ":")).encode()
         line = b"%08x %s\n" % (zlib.crc32(text), text)
-        with (self.folder / f"rank_{rank}.jsonl").open("ab+") as file:
+        path = self.folder / f"rank_{rank}.jsonl"
+        with writing(path), path.open("ab+") as file:
             if file.tell() > 0:
                 file.seek(-1, os.SEEK_END)
                 line = line if file.read(1) == b"\n" else b"\n" + line  # after a line that was cut short
@@ -66,7 +68,7 @@ class Journal:
             os.fsync(file.fileno())
 
     def finish(self) -> None:
-        """Remove the journal; beside results it counts for nothing."""
+        """Remove the journal, when all that is made of it is there."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _read(self) -> Iterator[SolvedBatch]:
@@ -88,8 +90,6 @@ class Journal:
 
 def unfinished(folder: Path) -> dict[str, Any] | None:
     """What the unfinished evaluation in a run's folder is of, None where there is none."""
-    if (folder / RESULT).exists():
-        return None
     try:
         subject: dict[str, Any] = json.loads((folder / FOLDER / SUBJECT).read_text(encoding="utf-8"))
         whole = isinstance(subject["config"], dict) and isinstance(subject["checkpoint"], str | None)

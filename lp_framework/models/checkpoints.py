@@ -9,22 +9,28 @@ config.yaml, metrics.csv, training.png    where they come from: the run's config
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
 import torch
+from lightning.pytorch import callbacks
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from lp_framework import registry
+from lp_framework.atomic import written
 from lp_framework.data.files import read_json, written_folder
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import RECIPE, TrainedModule
+from lp_framework.run_folders import relative
 
 FOLDER = "checkpoints"
 LATEST = "latest"
@@ -33,6 +39,43 @@ TRAINED_ON = {"general": "3,940 procedural objects"}
 SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
 CONFIG, WEIGHTS = "model.json", "model.safetensors"
 ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
+
+
+class WholeCheckpointIO(TorchCheckpointIO):
+    """Lightning's files, whole or not at all: its own way copies them from the system's temporary folder, where that is
+    on another disk, over the earlier ones."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a checkpoint beside the one that it replaces; `UserError` that names it where that fails."""
+        content = io.BytesIO()  # given a file, torch has an error of its own for a full disk
+        torch.save(checkpoint, content)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        with written(relative(Path(path))) as partial:
+            partial.write_bytes(content.getbuffer())
+
+
+class ModelCheckpoint(callbacks.ModelCheckpoint):
+    """Lightning's, but its paths are relative to the run's folder of checkpoints, so that a run may be moved.
+
+    The name, which is in checkpoints, is Lightning's, so that earlier runs go on.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Lightning's, with names of files for paths."""
+        return _mapped(super().state_dict(), lambda path: Path(path).name) | {"dirpath": ""}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take a state with paths of any folder for one of this folder."""
+        folder = Path(str(self.dirpath))
+        state = _mapped(state_dict, lambda path: str(folder / Path(path).name))
+        super().load_state_dict(state | {"dirpath": self.dirpath})
+
+
+def _mapped(state: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    """The state of a `ModelCheckpoint` with its paths changed, as far as they are set."""
+    paths = {key: change(path) for key, path in state.items() if key.endswith("_model_path") and path}
+    scores = {change(path): score for path, score in state["best_k_models"].items()}
+    return state | paths | {"best_k_models": scores}
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

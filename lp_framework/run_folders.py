@@ -1,0 +1,58 @@
+"""The folder of a run: one command at a time works in it, and none is left behind with nothing in it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from lp_framework.atomic import FULL, DiskFull, reason
+from lp_framework.errors import UserError
+
+HYDRA, LOCK = ".hydra", ".lock"
+
+
+def relative(folder: Path) -> Path:
+    """A folder relative to the working directory where it lies below it."""
+    return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+
+
+class Held(UserError):
+    """Another command works in this folder."""
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Have a run's folder to oneself until the end of the block, or of the process.
+
+    `Held` where another process has it, `DiskFull` for want of room in the block. Of several processes of a run the
+    first holds the folder; one that does not exist is nobody's.
+    """
+    from lightning.pytorch.utilities import rank_zero_only  # a command has loaded it by now
+
+    lock = FileLock(folder / LOCK)
+    if rank_zero_only.rank == 0 and folder.is_dir():  # type: ignore[attr-defined]  # set at import
+        try:
+            lock.acquire(timeout=0)
+        except Timeout as error:
+            raise Held(f"{folder}: another command works in this folder; let it finish, or choose another") from error
+        except OSError as error:
+            raise UserError(f"{folder / LOCK}: cannot be written ({reason(error, folder)})") from error
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        file = Path(error.filename or folder)
+        raise DiskFull(f"{file}: cannot be written ({reason(error, file)})") from error
+    finally:
+        lock.release()
+
+
+def remove_if_empty(folder: Path, log: str) -> None:
+    """Remove a run's folder that has nothing but its `log`, the lock, and what Hydra puts into every one."""
+    if folder.is_dir() and {each.name for each in folder.iterdir()} <= {HYDRA, LOCK, log} and folder != Path.cwd():
+        shutil.rmtree(folder, ignore_errors=True)
