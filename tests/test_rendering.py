@@ -2,6 +2,7 @@ import errno
 import json
 import math
 import os
+import shutil
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -21,6 +22,7 @@ from lp_framework.data.rendering.pyrender_renderer import AutoRenderer, Pyrender
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.rendering.renderer import Renderer, View, downsample
 from lp_framework.data.rendering.views import ViewProtocol, render_object, render_objects
+from lp_framework.data.sets.rendered import MeshData
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, to_ifusion, view_pose
 
@@ -501,7 +503,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
     with pytest.raises(UserError, match=r"cube was rendered differently \(resolution was 16, is 24\); choose another"):
         render_object(obj, tmp_path, finer, FlatRenderer())
     other = MeshObject("cube", "unique", lambda: trimesh.Scene(vertex_coloured_torus()))
-    with pytest.raises(UserError, match=r"rendered differently.*mesh was"):
+    with pytest.raises(UserError, match=rf"the views in {tmp_path} are of another mesh.*; choose another folder"):
         render_object(other, tmp_path, SMALL, FlatRenderer())
     render_object(obj, tmp_path, SMALL, FlatRenderer(fails_at=0))
 
@@ -567,10 +569,118 @@ def test_a_full_disk_is_a_user_error_and_keeps_what_is_finished(tmp_path, monkey
         save(image, path, **options)
 
     monkeypatch.setattr(Image.Image, "save", save_while_there_is_room)
-    with pytest.raises(UserError, match=r"1 of 2 objects could not be rendered: second: .*No space left on device"):
-        render_objects(objects_named("first", "second"), tmp_path, SMALL, FlatRenderer(), workers=1)
+    with pytest.raises(UserError, match=r"second: cannot be written \(No space left on device, .* MB are free\)"):
+        render_objects(objects_named("first", "second", "third"), tmp_path, SMALL, FlatRenderer(), workers=1)
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["first"]
     assert len(contents(tmp_path / "first")) == 11 + 2 + 1
+    monkeypatch.undo()
+    resumed = FlatRenderer()
+    render_objects(objects_named("first", "second", "third"), tmp_path, SMALL, resumed, workers=1)
+    assert resumed.drawn == 2 * 11
+
+
+# ---------------------------------------------------------------- the files that views are made from
+
+
+@pytest.fixture
+def coloured(tmp_path):
+    """`coloured("red", (255, 0, 0))`: a folder with a cube of that colour, as PLY, and as OBJ with its material."""
+
+    def make(place: str, colour: tuple[int, int, int]) -> Path:
+        folder = tmp_path / place / "meshes"
+        folder.mkdir(parents=True, exist_ok=True)
+        box = trimesh.creation.box()
+        box.visual.vertex_colors = [*colour, 255]
+        box.export(folder / "ply.ply")
+        lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["mtllib paint.mtl", "usemtl paint"]
+        lines += ["f " + " ".join(str(corner + 1) for corner in face) for face in box.faces]
+        (folder / "obj.obj").write_text("\n".join(lines))
+        (folder / "paint.mtl").write_text("newmtl paint\nKd {} {} {}\n".format(*(part / 255 for part in colour)))
+        return folder
+
+    return make
+
+
+def views_of(folder: Path, views: Path, renderer: Renderer | None = None) -> MeshData:
+    data = MeshData(
+        renderer or RaycastRenderer(), str(folder), str(views), resolution=16, test_views=2, train_views=2, workers=1
+    )
+    data.prepare()
+    return data
+
+
+def seen_colour(views: Path, name: str) -> list[bool]:
+    """Whether the first view of an object has red, green, blue in it."""
+    pixels = np.asarray(Image.open(views / name / "test" / "rgb" / "000.png"))
+    return [bool(pixels[pixels[..., 3] == 255][:, channel].max() > 60) for channel in range(3)]
+
+
+def test_views_of_other_meshes_of_the_same_names_are_not_taken(coloured, tmp_path):
+    views, red, blue = tmp_path / "views", coloured("red", (255, 0, 0)), coloured("blue", (0, 0, 255))
+    views_of(red, views)
+    assert [seen_colour(views, name) for name in ("ply", "obj")] == [[True, False, False]] * 2
+    before = contents(views)
+    with pytest.raises(UserError, match=rf"2 of 2 objects .*: obj, ply: the views in {views} are of another mesh"):
+        views_of(blue, views)
+    assert contents(views) == before
+    views_of(blue, tmp_path / "others")
+    assert [seen_colour(tmp_path / "others", name) for name in ("ply", "obj")] == [[False, False, True]] * 2
+
+
+@pytest.mark.parametrize(("file", "name"), [("ply.ply", "ply"), ("obj.obj", "obj"), ("paint.mtl", "obj")])
+def test_a_mended_mesh_or_material_is_noticed(coloured, tmp_path, file, name):
+    views, red, blue = tmp_path / "views", coloured("red", (255, 0, 0)), coloured("blue", (0, 0, 255))
+    views_of(red, views)
+    mended = blue / file
+    if file == "obj.obj":
+        mended.write_text(mended.read_text().replace("v -0.5", "v -0.25"))
+    times = (red / file).stat()
+    (red / file).write_bytes(mended.read_bytes())
+    os.utime(red / file, ns=(times.st_atime_ns, times.st_mtime_ns))  # a mend that keeps size and time
+    with pytest.raises(
+        UserError, match=rf"1 of . objects could not be rendered: {name}: the views in .* are of another"
+    ):
+        views_of(red, views)
+    shutil.rmtree(views / name)
+    views_of(red, views)
+
+
+def test_meshes_that_are_the_same_elsewhere_or_beside_other_files_render_nothing_anew(coloured, tmp_path, monkeypatch):
+    views, red = tmp_path / "views", coloured("red", (255, 0, 0))
+    views_of(red, views)
+    record = json.loads((views / "ply" / "render.json").read_text())
+    assert set(record["files"]) == {"content", "stamp"}
+    load = MeshData.load
+    monkeypatch.setattr(MeshData, "load", staticmethod(lambda path: pytest.fail(f"{path} was loaded")))
+    views_of(red, views, FlatRenderer(fails_at=0))
+    red.rename(tmp_path / "moved")
+    views_of(tmp_path / "moved", views, FlatRenderer(fails_at=0))
+    monkeypatch.setattr(MeshData, "load", staticmethod(load))
+    (tmp_path / "moved" / "unused.png").write_bytes(b"not of any mesh")  # the meshes are loaded once, to see so
+    for name in ("ply", "obj"):
+        older = json.loads((views / name / "render.json").read_text())
+        if name == "obj":
+            del older["files"]  # as earlier versions left it
+        (views / name / "render.json").write_text(json.dumps(older))
+    views_of(tmp_path / "moved", views, FlatRenderer(fails_at=0))
+    monkeypatch.setattr(MeshData, "load", staticmethod(lambda path: pytest.fail(f"{path} was loaded")))
+    views_of(tmp_path / "moved", views, FlatRenderer(fails_at=0))
+
+
+def test_a_file_of_labels_holds_for_all_objects_whatever_their_views_were_rendered_with(coloured, tmp_path):
+    views, red, labels = tmp_path / "views", coloured("red", (255, 0, 0)), tmp_path / "labels.yaml"
+
+    def ambiguities(text: str) -> list[str]:
+        labels.write_text(text)
+        data = MeshData(
+            RaycastRenderer(), str(red), str(views), str(labels), resolution=16, test_views=2, train_views=2, workers=1
+        )
+        data.prepare()
+        return [data.views(name, "test").ambiguity for name in ("ply", "obj")]
+
+    assert ambiguities("ply: {ambiguity: unique}\nobj: {ambiguity: twofold}") == ["unique", "twofold"]
+    with pytest.warns(UserWarning, match="so that they stay unlabelled: obj"):
+        assert ambiguities("ply: {ambiguity: continuous}") == ["continuous", "unlabelled"]
 
 
 @pytest.mark.heavy

@@ -1,6 +1,7 @@
 """From objects to views on disk by the paper's protocol (appendix, Dataset Construction).
 
-The layout is that of `data.views`, with one `render.json` an object that says how it was rendered.
+The layout is that of `data.views`, with one `render.json` an object that says how it was rendered, and from
+which files.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import os
 import threading
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
@@ -24,9 +25,11 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from lp_framework.atomic import DiskFull, written
 from lp_framework.data.cache import tracked
 from lp_framework.data.files import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.meshes import MeshObject, fingerprint
+from lp_framework.data.origins import Origin
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, nerf_transforms, write_transforms
 from lp_framework.errors import UserError, check_settings
@@ -124,21 +127,36 @@ def _steps(start: float, end: float, step: float) -> NDArray[np.floating]:
     return start + step * np.arange(math.floor((end - start) / step + 1e-9) + 1)
 
 
-def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> None:
-    """Render an object into `<root>/<name>`, whole or not at all, unless it is there already; `UserError` when it does
-    not load, when its folder holds something else, and when it cannot be written."""
+def render_object(
+    obj: MeshObject,
+    root: str | Path,
+    protocol: ViewProtocol,
+    renderer: Renderer,
+    files: Mapping[str, str] | None = None,
+) -> None:
+    """Render an object into `<root>/<name>`, whole or not at all, unless it is there already; `files` is the record of
+    its `Origin`. `UserError` when it does not load, when its folder holds something else, and when it cannot be
+    written."""
     folder = Path(root) / obj.name
     scene = obj.load()
     mesh, settings = fingerprint(scene), asdict(protocol)
+    of_files = {} if files is None else {"files": files}
     if folder.exists():
-        changes = _changes(folder, protocol, mesh=mesh)
-        if changes:
+        if changes := _changes(folder, protocol):
             raise UserError(f"{folder} was rendered differently ({changes}); choose another folder or delete this one")
+        record = read_record(folder / RECORD)
+        if record.get("mesh") != mesh:
+            other = "of another mesh, or of an earlier version's reading of it"
+            raise UserError(f"the views in {root} are {other}; choose another folder of views or delete them")
+        if files is not None:  # the same mesh in other files
+            with written(folder / RECORD) as partial:
+                partial.write_text(json.dumps(record | of_files, indent=1))
         return
     labels = {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer}
     record = {
         "object": obj.name,
         "mesh": mesh,
+        **of_files,
         "renderer": renderer.name,
         **labels,
         "protocol": {key: value for key, value in settings.items() if key not in LATER or value != LATER[key]},
@@ -170,14 +188,21 @@ def render_object(obj: MeshObject, root: str | Path, protocol: ViewProtocol, ren
         (partial / RECORD).write_text(json.dumps(record, indent=1))
 
 
-def _changes(folder: Path, protocol: ViewProtocol, **mesh: str) -> str:
+def _changes(folder: Path, protocol: ViewProtocol) -> str:
     """How an object's views differ from what is wanted (see `differences`). Labels may differ, they are not rendered;
     depths that are there do no harm where they are not asked for."""
     record = read_record(folder / RECORD)
     if not isinstance(record.get("protocol"), dict):
         return f"it has no proper {RECORD}"
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
-    return differences({**LATER, **record["protocol"], "mesh": record.get("mesh")}, {**wanted, **mesh})
+    return differences({**LATER, **record["protocol"]}, wanted)
+
+
+def _is_finished(folder: Path, protocol: ViewProtocol, origin: Origin | None) -> bool:
+    """Whether an object's views are there as wanted; `origin` is None where its files are not at hand."""
+    if _changes(folder, protocol):
+        return False
+    return origin is None or origin.is_of(read_record(folder / RECORD).get("files"))
 
 
 def render_objects(
@@ -187,15 +212,18 @@ def render_objects(
     renderer: Renderer,
     workers: int | None = None,
     check_meshes: bool = True,
+    origins: Mapping[str, Origin] | None = None,
 ) -> None:
     """Render objects into `<root>/<name>`, in `workers` processes (None: one a CPU core); finished ones are skipped.
 
-    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them. Two runs into one
-    folder take turns. A `UserError` of one object does not stop the others; one at the end lists them all.
+    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them; without it those
+    are loaded whose files, by name in `origins`, are not those that the views were made from. Two runs into one folder
+    take turns. A `UserError` of one object does not stop the others, unless the disk is full; one at the end lists them
+    all.
     """
-    todo = list(objects)
+    todo, origins = list(objects), origins or {}
     if not check_meshes:
-        todo = [obj for obj in todo if _changes(Path(root) / obj.name, protocol)]
+        todo = [obj for obj in todo if not _is_finished(Path(root) / obj.name, protocol, origins.get(obj.name))]
     if not todo:
         return
     if workers is None:
@@ -204,7 +232,8 @@ def render_objects(
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
         work = partial(_work, root=root, protocol=protocol, renderer=renderer)
-        done = _in_processes(work, todo, workers) if workers > 1 else map(work, todo)
+        files = [origins[obj.name].record() if obj.name in origins else None for obj in todo]
+        done = _in_processes(work, todo, files, workers) if workers > 1 else map(work, todo, files)
         for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
             for message in messages:
                 warnings.warn(message, stacklevel=2)
@@ -216,22 +245,28 @@ def render_objects(
 Outcome = tuple[str | None, list[str]]  # the message of an object's `UserError`, those of its warnings
 
 
-def _work(obj: MeshObject, root: str | Path, protocol: ViewProtocol, renderer: Renderer) -> Outcome:
+def _work(
+    obj: MeshObject, files: Mapping[str, str] | None, root: str | Path, protocol: ViewProtocol, renderer: Renderer
+) -> Outcome:
     failure = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            render_object(obj, root, protocol, renderer)
+            render_object(obj, root, protocol, renderer, files)
+        except DiskFull:
+            raise
         except UserError as error:
             failure = str(error)
     return failure, [str(each.message) for each in caught if issubclass(each.category, UserWarning)]
 
 
-def _in_processes(work: Callable[[MeshObject], Outcome], objects: list[MeshObject], workers: int) -> Iterator[Outcome]:
+def _in_processes(
+    work: Callable[..., Outcome], objects: list[MeshObject], files: list[dict[str, str] | None], workers: int
+) -> Iterator[Outcome]:
     context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as executor:
         try:
-            yield from executor.map(work, objects)
+            yield from executor.map(work, objects, files)
         except BrokenProcessPool as error:
             what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
             raise UserError(f"{what}, run the same command again with fewer workers") from error

@@ -16,11 +16,13 @@ from typing import Any, ClassVar, Literal
 
 import trimesh
 import yaml
+from PIL import Image
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below
 from lp_framework.data.mesh_files.common import MissingColourWarning
 from lp_framework.data.meshes import MeshObject, load_scene
+from lp_framework.data.origins import Origin
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
 from lp_framework.data.toy import toy_objects
@@ -74,6 +76,8 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
 class RenderedData(ViewSource):
     """Views that are rendered from meshes on first use, into `path`, by a protocol with the settings `protocol`."""
 
+    labels: Path | None = None  # a file that says the objects' ambiguity classes
+
     def __init__(self, renderer: Renderer, path: str | Path, workers: int | None, **protocol: Any) -> None:
         self.renderer, self.path, self.workers = renderer, Path(path), workers
         self.protocol = ViewProtocol(**protocol)
@@ -86,13 +90,18 @@ class RenderedData(ViewSource):
         return sorted(obj.name for obj in self.objects())
 
     def prepare(self, check_meshes: bool = False) -> None:
-        """Render what is missing; `check_meshes`: the meshes of the others must be those their views were made from."""
-        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers, check_meshes)
+        """Render what is missing; the others must be of the files at hand, or with `check_meshes` of what they hold."""
+        objects, origins = self.objects(), self.origins()
+        render_objects(objects, self.path, self.protocol, self.renderer, self.workers, check_meshes, origins)
+
+    def origins(self) -> dict[str, Origin]:
+        """The files of each object, as far as they are at hand; none for objects that this package makes."""
+        return {}
 
     def views(self, name: str, split: str) -> ObjectViews:
-        """The views, with the label of the object where it has any, whatever the views were rendered with."""
+        """The views, with the label of the object, whatever they were rendered with; theirs where nothing labels it."""
         views, obj = super().views(name, split), self._by_name[name]
-        if obj.ambiguity == "unlabelled":
+        if obj.ambiguity == "unlabelled" and self.labels is None:
             return views
         return replace(views, ambiguity=obj.ambiguity, unique_answer=obj.unique_answer)
 
@@ -200,6 +209,18 @@ class MeshData(RenderedData):
         """What loads a mesh."""
         return partial(load_scene, file, self.up)
 
+    def origins(self) -> dict[str, Origin]:
+        """The mesh of each object, beside the materials, buffers and images that any of them may refer to."""
+        beside = Origin(self._parts(self.meshes))
+        files = {name: self.file(name) for name in self.names()}
+        return {name: Origin([file], beside, self.up) for name, file in files.items() if file.is_file()}
+
+    def _parts(self, folder: Path) -> list[Path]:
+        """The files below a folder that meshes refer to."""
+        suffixes = {".mtl", ".bin", *Image.registered_extensions()}
+        found = (file for file in folder.rglob("*") if file.suffix.lower() in suffixes and file.is_file())
+        return sorted(file for file in found if not file.is_relative_to(self.path) and file.name[0] != ".")
+
     def _object(self, name: str) -> MeshObject:
         load, label = self.loader(self.file(name)), self._labels.get(name)
         if label is None:
@@ -255,6 +276,12 @@ class ScannedData(MeshData):
 
     def file(self, name: str) -> Path:
         return self.meshes / self.layout.format(name=name, category=name.rpartition("_")[0])
+
+    def origins(self) -> dict[str, Origin]:
+        """The mesh of each object and what lies in its folder."""
+        files = {name: self.file(name) for name in self.names()}
+        parts = {name: self._parts(file.parents[1]) for name, file in files.items()}
+        return {name: Origin([file, *parts[name]]) for name, file in files.items() if file.is_file()}
 
     def available(self) -> list[str]:
         pattern = self.layout.format(name="*", category="*")
