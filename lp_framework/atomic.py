@@ -21,11 +21,11 @@ class DiskFull(UserError):
 
 
 def reason(error: Exception, path: Path) -> str:
-    """Why `path` cannot be written, with the space that is left on a full disk."""
+    """Why `path` cannot be written; of a full disk, how much space is not enough."""
     text = getattr(error, "strerror", None) or str(error)
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         existing = next(each for each in (path, *path.absolute().parents) if each.exists())
-        text += f", {shutil.disk_usage(existing).free / 1e6:.1f} MB are free"
+        text += f": it needs more than the {shutil.disk_usage(existing).free / 1e6:.1f} MB that are free"
     return text
 
 

@@ -26,7 +26,7 @@ def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
         (RuntimeError("bug"), "bug"),
         (KeyboardInterrupt("stop"), "stop"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
-         r"a\.txt: cannot be written \(No space left on device, \d+\.\d MB are free\)"),
+         r"a\.txt: cannot be written \(No space left on device: it needs more than the \d+\.\d MB that are free\)"),
         (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)), r"a\.txt: cannot be written \(Disk quota exceeded\)"),
         (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), r"a\.txt: cannot be written \(Permission denied\)"),
     ],

@@ -94,7 +94,7 @@ def test_objects_json(tmp_path, content):
 @given(content=json_damage({"object": "cup", "source": "download", "left_out": {}}))
 def test_conversion_json(tmp_path, content):
     (tmp_path / "conversion.json").write_bytes(content)
-    assert is_converted(tmp_path, {"source": "download"}) in (True, False)
+    assert is_converted(tmp_path, {"source": "download"}, tmp_path) in (True, False)
 
 
 # ---------------------------------------------------------------- data sets

@@ -95,7 +95,7 @@ def test_a_download_is_left_alone_and_converted_once(make, root, tmp_path):
     assert content["left_out"] == {"occluded": 3} and content["largest_turn_degrees"] > 10
     make().prepare()
     assert record.stat().st_mtime_ns == stamp
-    with pytest.raises(UserError, match="holds other views than these settings make"):
+    with pytest.raises(UserError, match="holds other views than these files and settings make"):
         make(train_views=4).prepare()
 
 

@@ -569,7 +569,10 @@ def test_a_full_disk_is_a_user_error_and_keeps_what_is_finished(tmp_path, monkey
         save(image, path, **options)
 
     monkeypatch.setattr(Image.Image, "save", save_while_there_is_room)
-    with pytest.raises(UserError, match=r"second: cannot be written \(No space left on device, .* MB are free\)"):
+    with pytest.raises(
+        UserError,
+        match=r"second: cannot be written \(No space left on device: it needs more than the .* MB that are free\)",
+    ):
         render_objects(objects_named("first", "second", "third"), tmp_path, SMALL, FlatRenderer(), workers=1)
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["first"]
     assert len(contents(tmp_path / "first")) == 11 + 2 + 1

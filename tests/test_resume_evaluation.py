@@ -187,7 +187,9 @@ def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, 
             patch.setattr("lp_framework.commands.eval.save_pictures", no_room_for_pictures)
         ran = commands.here(name, "eval", *EVALUATION, f"pictures={str(place == 'pictures').lower()}")
     file = {"journal": "unfinished/rank_0.jsonl", "tables": "pairs.csv", "pictures": "pictures/errors.png"}[place]
-    said = rf"{name}/{file}: cannot be written \(No space left on device, [\d.]+ MB are free\)"
+    said = (
+        rf"{name}/{file}: cannot be written \(No space left on device: it needs more than the [\d.]+ MB that are free\)"
+    )
     assert re.fullmatch(f"{said}; make room, then resume={name} goes on", ran.error)
     again = commands.here("unused", "eval", f"resume={name}", "pictures=false")
     assert went_on(again) == (4 * BATCH if place == "journal" else PAIRS)

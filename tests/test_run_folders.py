@@ -45,7 +45,8 @@ def test_death_frees_a_folder(tmp_path: Path):
 @pytest.mark.parametrize("file", [None, "events.out"])
 def test_a_full_disk_is_told_with_the_file_where_the_system_knows_it(file: str | None, tmp_path: Path):
     error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *([] if file is None else [str(tmp_path / file)]))
-    expected = rf"{tmp_path / (file or '')}: cannot be written \(No space left on device, [\d.]+ MB are free\)"
+    room = r"No space left on device: it needs more than the [\d.]+ MB that are free"
+    expected = rf"{tmp_path / (file or '')}: cannot be written \({room}\)"
     with pytest.raises(DiskFull, match=expected), held(tmp_path):
         raise error
     with pytest.raises(PermissionError), held(tmp_path):

@@ -271,8 +271,8 @@ def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_o
         ran = commands.here("filled", "train")
     folder = commands.folder / "filled"
     assert re.fullmatch(
-        r"filled/checkpoints/(best|last)\.ckpt: cannot be written \(No space left on device, [\d.]+ MB are free\); "
-        r"make room, then resume=filled goes on",
+        r"filled/checkpoints/(best|last)\.ckpt: cannot be written \(No space left on device: it needs more than the "
+        r"[\d.]+ MB that are free\); make room, then resume=filled goes on",
         ran.error,
     )
     assert sorted(each.name for each in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]

@@ -43,6 +43,7 @@ from lp_framework.data.sets.converted import Annotated, Photograph, Photographed
 from lp_framework.errors import UserError
 from lp_framework.registry import register
 
+FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 FORMATS = {"ndc_isotropic": True, "ndc_norm_image_bounds": False}
 SAMPLES = 4000  # pixels of a mask that its extent is taken from
 BLACK = 8  # an image that is nowhere brighter is one that was blackened for the challenge
@@ -95,17 +96,22 @@ class CO3DData(PhotographedData):
                     listed |= {(str(name), int(number)) for frames in content.values() for name, number, _ in frames}
         return listed
 
+    def annotations(self, name: str) -> list[Path]:
+        folder = self.download / name.partition("-")[0]
+        cloud, _ = _cloud_and_scores(folder / SEQUENCES, name.partition("-")[2], self.download)
+        return [folder / FRAMES, folder / SEQUENCES, *([] if cloud is None else [cloud])]
+
     def photographs(self, name: str) -> Annotated:
         category, _, sequence = name.partition("-")
         folder = self.download / category
         listed = {number for found, number in self._listed(folder) if found == sequence}
-        file = folder / "frame_annotations.jgz"
+        file = folder / FRAMES
         annotated = _of_sequence(file, sequence)
         frames = {each["frame_number"]: each for each in annotated if isinstance(each.get("frame_number"), int)}
         if missing := sorted(listed - frames.keys()):
             raise UserError(f"{file}: has no frame {missing[0]} of sequence '{sequence}', which the set list names")
         photographs = [_photograph(frames[number], self.download, file) for number in sorted(listed)]
-        cloud, scores = _cloud_and_scores(folder / "sequence_annotations.jgz", sequence, self.download)
+        cloud, scores = _cloud_and_scores(folder / SEQUENCES, sequence, self.download)
         with expecting(f"{folder / sequence}: the object's frame cannot be told"):
             return _in_object_frame(photographs, cloud, scores)
 

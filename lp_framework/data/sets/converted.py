@@ -1,7 +1,7 @@
 """Photographs with cameras, converted once into views on disk; everything after that is as with rendered views.
 
 Crops around the object by `real_cameras`, chosen so that their viewpoints are spread evenly. `conversion.json` beside
-an object's views says what they were made from and what was left out.
+an object's views says what they were made from, by which files, and what was left out.
 
 Beside what every `transform.json` has, a frame keeps its photograph (`source`, `width`, `height`), its camera
 (`photograph_camera`, in the object's frame, and `photograph_intrinsics`, pixels), the `turn_degrees` and
@@ -27,10 +27,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from lp_framework.atomic import DiskFull
 from lp_framework.data import real_cameras
 from lp_framework.data.cache import tracked
 from lp_framework.data.files import LIST, differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.masks import HALF, mask_opacity
+from lp_framework.data.origins import Origin
 from lp_framework.data.photographs import read_image, read_mask
 from lp_framework.data.views import ViewSource, write_transforms
 from lp_framework.errors import UserError, check_settings
@@ -91,8 +93,9 @@ class ConvertedSource(ViewSource):
     download: Path
 
     @abstractmethod
-    def convert(self, name: str, folder: Path) -> dict[str, Any]:
-        """Write an object's views into a folder; what its record is to keep beside `demands`."""
+    def convert(self, name: str, folder: Path) -> tuple[list[Path], dict[str, Any]]:
+        """Write an object's views into a folder; the files that they are made from, and what its record is to keep
+        beside them and `demands`."""
 
     def demands(self) -> dict[str, Any]:
         """What of the settings decides an object's views, as plain values."""
@@ -103,10 +106,12 @@ class ConvertedSource(ViewSource):
         failures: dict[str, str] = {}
         with locked(self.path, ".convert.lock"):
             objects = self.names()
-            missing = [name for name in objects if not is_converted(self.path / name, self.demands())]
+            missing = [name for name in objects if not is_converted(self.path / name, self.demands(), self.download)]
             for name in tracked(missing, "converting photographs"):
                 try:
                     self._write(name)
+                except DiskFull:
+                    raise
                 except UserError as error:
                     failures[name] = str(error)
         listed = self.path / LIST
@@ -116,17 +121,25 @@ class ConvertedSource(ViewSource):
     def _write(self, name: str) -> None:
         folder = self.path / name
         if folder.exists():
-            others = f"holds other views than these settings make (see its {RECORD})"
+            others = f"holds other views than these files and settings make (see its {RECORD})"
             raise UserError(f"{folder}: {others}; choose another data.views or delete it")
         with written_folder(folder) as partial:
-            record = {"object": name, **self.demands(), **self.convert(name, partial)}
-            (partial / RECORD).write_text(json.dumps(record, indent=1))
+            files, record = self.convert(name, partial)
+            made = {"files": [os.path.relpath(file, self.download) for file in files], "origin": Origin(files).record()}
+            (partial / RECORD).write_text(json.dumps({"object": name, **self.demands(), **record, **made}, indent=1))
 
 
-def is_converted(folder: Path, demands: Mapping[str, Any]) -> bool:
-    """Whether a folder holds an object's views that were made as its record, and `demands`, say."""
+def is_converted(folder: Path, demands: Mapping[str, Any], download: Path) -> bool:
+    """Whether a folder holds an object's views that were made as its record, and `demands`, say, and from the files
+    that are in the download, where it is at hand and the record names them."""
     record = read_record(folder / RECORD)
-    return bool(record) and not differences(record, demands)
+    names = record.get("files")
+    if not record or differences(record, demands):
+        return False
+    if not isinstance(names, list) or not download.is_dir():  # of an earlier version, or nothing to compare with
+        return True
+    files = [download / str(name) for name in names]
+    return all(map(os.path.isfile, files)) and Origin(files).is_of(record.get("origin"))
 
 
 def frame(file: str, camera: Tensor) -> dict[str, Any]:
@@ -155,11 +168,15 @@ class PhotographedData(ConvertedSource):
     def photographs(self, name: str) -> Annotated:
         """An object's photographs and its extent, in the object's frame."""
 
+    @abstractmethod
+    def annotations(self, name: str) -> list[Path]:
+        """The files that say what `photographs` knows of an object."""
+
     def demands(self) -> dict[str, Any]:
         names = ("train_views", "test_views", "resolution", "split_seed")
         return {**super().demands(), **{name: getattr(self, name) for name in names}}
 
-    def convert(self, name: str, folder: Path) -> dict[str, Any]:
+    def convert(self, name: str, folder: Path) -> tuple[list[Path], dict[str, Any]]:
         photographs, points, left_out, remarks = self.photographs(name)
         views, more = sound_views(photographs, points)
         left_out += more
@@ -187,7 +204,8 @@ class PhotographedData(ConvertedSource):
                 frames.append(self._frame(file, views[index]))
             write_transforms(folder / split, frames)
         taken = [views[index] for index in chosen]
-        return {
+        files = [file for view in taken for file in (view.photograph.file, view.photograph.mask)]
+        return [*self.annotations(name), *files], {
             **remarks,
             "left_out": dict(left_out),
             "median_perspective_residual": float(np.median([view.residual for view in taken])),

@@ -35,6 +35,7 @@ from lp_framework.errors import UserError
 from lp_framework.geometry import from_opencv, inverse, rigid_transform
 from lp_framework.registry import register
 
+MODELS = Path("models") / "models_info.json"
 ANNOTATIONS = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
 UNITS = {  # what takes cam_t_m2c to the unit of the models, and what that means
     1.0: "models and cam_t_m2c in the same unit",
@@ -96,6 +97,10 @@ class HOPEv2Data(PhotographedData):
         """The objects that have a model, `obj_000001` and so on."""
         return kept_lists(self.path, {}, lambda: ObjectLists([f"obj_{n:06d}" for n in sorted(self._frames())], [])).seen
 
+    def annotations(self, name: str) -> list[Path]:
+        scenes = sorted({each.scene for each in self._instances.get(int(name.removeprefix("obj_")), [])})
+        return [self.download / MODELS, *(scene / file for scene in scenes for file in ANNOTATIONS)]
+
     def photographs(self, name: str) -> Annotated:
         number = int(name.removeprefix("obj_"))
         frame = self._frames()[number]
@@ -108,7 +113,7 @@ class HOPEv2Data(PhotographedData):
 
     def _frames(self) -> dict[int, ObjectFrame]:
         """The objects' frames in those of their models, by number; in their unit."""
-        file = self.download / "models" / "models_info.json"
+        file = self.download / MODELS
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
             frames = {int(number): _frame(info) for number, info in read_json(file).items()}
         if not frames or not all(frame.longest_side > 0 for frame in frames.values()):

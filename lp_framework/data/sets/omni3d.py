@@ -48,9 +48,9 @@ class Omni3DData(ConvertedSource):
             raise UserError(f"{self.download}: {only}; evaluate on it, or train on other data")
         return super().views(name, split)
 
-    def convert(self, name: str, folder: Path) -> dict[str, Any]:
+    def convert(self, name: str, folder: Path) -> tuple[list[Path], dict[str, Any]]:
         (folder / "test" / "rgb").mkdir(parents=True)
-        frames = []
+        frames, files = [], []
         for view, camera in omni3d_cameras(self.download, name).items():
             file = self.download / name / "images" / f"{view}.png"
             image = read_image(file)
@@ -60,8 +60,9 @@ class Omni3DData(ConvertedSource):
                 raise UserError(f"{file}: is {image.width} x {image.height} pixels; views must be square")
             shutil.copyfile(file, folder / "test" / "rgb" / file.name)
             frames.append(frame(file.name, camera))
+            files += [file, self.download / name / "poses" / f"{view}.npy"]
         write_transforms(folder / "test", frames)
-        return {}
+        return files, {}
 
 
 def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
