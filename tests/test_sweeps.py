@@ -185,6 +185,18 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
     assert "skipped" in sweep("seed=0").out
 
 
+def test_results_of_other_views_are_not_taken(sweep, commands):
+    assert sweep("seed=0").status == 0
+    image = commands.folder / "views" / "cup" / "test" / "rgb" / "000.png"
+    kept = image.read_bytes()
+    image.write_bytes((image.parent / "001.png").read_bytes())
+    try:
+        assert f"{sweep.folder.name}/0: holds the results of other views; give another" in sweep("seed=0").err
+    finally:
+        image.write_bytes(kept)
+    assert "skipped" in sweep("seed=0").out
+
+
 def test_a_single_run_is_made_anew(commands):
     for _ in range(2):
         ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2")

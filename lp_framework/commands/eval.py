@@ -51,7 +51,7 @@ def run(config: DictConfig) -> None:
     components = building.Components(settings, checkpoint)
     if "model" in components.needs("solver") and checkpoint is None:
         components.checkpoint = find_checkpoint(settings["checkpoint"])
-    if settings["resume"] is None and is_finished(folder, settings, components.checkpoint):
+    if settings["resume"] is None and is_finished(folder, settings, components):
         return
     building.warn_of_unused(components)
     solver, starts, data = components["solver"], components["start"], components["data"]
@@ -99,8 +99,9 @@ def run(config: DictConfig) -> None:
         kept.finish()
 
 
-def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | None) -> bool:
-    """Whether `folder` has the results of this very job of a sweep, not older than its checkpoint; then says so.
+def is_finished(folder: Path, settings: Mapping[str, Any], components: building.Components) -> bool:
+    """Whether `folder` has the results of this very job of a sweep, of the same views and not older than its
+    checkpoint; then says so.
 
     Raises `UserError` for other results, which are not overwritten; a job whose results cannot be read runs.
     """
@@ -109,9 +110,10 @@ def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | No
     file = folder / RESULT
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
-        previous = journal.compared_settings(result["config"])
+        previous, _ = journal.compared_settings(result["config"]), result["fingerprints"]["views"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
+    checkpoint = components.checkpoint
     before = {**previous, "checkpoint": result.get("checkpoint")}
     now = {**journal.compared_settings(json.loads(json.dumps(settings))), "checkpoint": checkpoint and str(checkpoint)}
     changed = journal.differences(before, now)
@@ -121,6 +123,9 @@ def is_finished(folder: Path, settings: Mapping[str, Any], checkpoint: Path | No
         raise UserError(f"{folder}: holds the results of another configuration ({said}); {advice}")
     if checkpoint is not None and checkpoint.stat().st_mtime > file.stat().st_mtime:
         raise UserError(f"{folder}: holds the results of an earlier {checkpoint}; {advice}")
+    data = components.test_views(settings["protocol"])
+    if result["fingerprints"]["views"] != data.fingerprint(data.evaluation_split()):
+        raise UserError(f"{folder}: holds the results of other views; {advice}")
     print(f"skipped, finished before: {folder}")
     return True
 

@@ -79,6 +79,7 @@ class PairDataModule(LightningDataModule):
         self.photographs, self.crop = photographs, crop
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
         self._extractor: FeatureExtractor | None = None
+        self._answer: list[str] = []  # of it
         self._carried: set[str] = set()
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images a set, where sets are evaluated
@@ -168,7 +169,7 @@ class PairDataModule(LightningDataModule):
 
     def cache_features(self, extractor: FeatureExtractor) -> None:
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
-        self._extractor = extractor
+        self._extractor, self._answer = extractor, _answer(extractor, self.image_size)
 
     def carry(self, *what: Literal["alpha", "depth", "points"]) -> None:
         """From now on batches carry the views' alpha channels, the depths that were rendered with them, or (of training
@@ -195,7 +196,8 @@ class PairDataModule(LightningDataModule):
         if "depth" in self._carried:
             arrays["depth"] = decoded_depths(files, self.image_size, self.cache)
         if (extractor := self._extractor) is not None:
-            feature_key, device = content_key([], "features", key, extractor.fingerprint()), self._device()
+            feature_key = content_key([], "features", key, extractor.fingerprint(), self._answer)
+            device = self._device()
             arrays["features"] = cached_array(
                 self.cache, feature_key, len(files), lambda: _extracted(extractor, images, device)
             )
@@ -244,6 +246,15 @@ class PairDataModule(LightningDataModule):
 
 def _folder(split: str) -> str:
     return "test" if split == "test" else "train"
+
+
+def _answer(extractor: FeatureExtractor, size: int) -> list[str]:
+    """What an extractor makes of one image, which its code and its settings change, too; so coarse that another machine
+    comes to the same."""
+    image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    with torch.inference_mode():
+        features = extractor.trunk(image).float().flatten()
+    return [f"{part.mean():.2e}" for part in features.abs().chunk(8)]
 
 
 def _extracted(extractor: FeatureExtractor, images: NDArray, device: torch.device) -> Iterator[NDArray]:
