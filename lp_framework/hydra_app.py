@@ -193,6 +193,7 @@ def _orderly_console() -> Iterator[None]:
         notes = logging.getLogger(name)
         notes.handlers.clear()  # Hydra's handlers, above it, take over
         notes.propagate = True
+    logging.raiseExceptions = False  # a log on a full disk is cut short without a traceback a line
     with warnings.catch_warnings():
         for beginning in OF_NO_USE:
             warnings.filterwarnings("ignore", beginning)

@@ -458,7 +458,7 @@ def test_finished_objects_are_believed_without_their_meshes_where_that_is_asked_
 def test_a_folder_without_its_record_is_not_believed(tmp_path, damage):
     render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
     damage(tmp_path / "cube")
-    with pytest.raises(UserError, match=r"cube was rendered differently \(it has no proper render\.json\)"):
+    with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no proper render\.json\)"):
         render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
 
 
@@ -500,10 +500,12 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
     (obj,) = objects_named("cube")
     render_object(obj, tmp_path, SMALL, FlatRenderer())
     finer = ViewProtocol(resolution=24, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)
-    with pytest.raises(UserError, match=r"cube was rendered differently \(resolution was 16, is 24\); choose another"):
+    with pytest.raises(
+        UserError, match=r"the views in .* were rendered differently \(resolution was 16, is 24\); choose another"
+    ):
         render_object(obj, tmp_path, finer, FlatRenderer())
     other = MeshObject("cube", "unique", lambda: trimesh.Scene(vertex_coloured_torus()))
-    with pytest.raises(UserError, match=rf"the views in {tmp_path} are of another mesh.*; choose another folder"):
+    with pytest.raises(UserError, match=r"rendered differently \(of another mesh, .*; choose another folder"):
         render_object(other, tmp_path, SMALL, FlatRenderer())
     render_object(obj, tmp_path, SMALL, FlatRenderer(fails_at=0))
 
@@ -511,7 +513,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     (tmp_path / "cube").mkdir()
     (tmp_path / "cube" / "thesis.txt").write_text("precious")
-    with pytest.raises(UserError, match=r"cube was rendered differently \(it has no proper render\.json\)"):
+    with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no proper render\.json\)"):
         render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer())
     assert contents(tmp_path) == {"cube/thesis.txt": b"precious"}
 
@@ -623,7 +625,9 @@ def test_views_of_other_meshes_of_the_same_names_are_not_taken(coloured, tmp_pat
     views_of(red, views)
     assert [seen_colour(views, name) for name in ("ply", "obj")] == [[True, False, False]] * 2
     before = contents(views)
-    with pytest.raises(UserError, match=rf"2 of 2 objects .*: obj, ply: the views in {views} are of another mesh"):
+    with pytest.raises(
+        UserError, match=rf"2 of 2 .*: obj, ply: the views in {views} were rendered differently \(of another mesh"
+    ):
         views_of(blue, views)
     assert contents(views) == before
     views_of(blue, tmp_path / "others")
@@ -641,7 +645,7 @@ def test_a_mended_mesh_or_material_is_noticed(coloured, tmp_path, file, name):
     (red / file).write_bytes(mended.read_bytes())
     os.utime(red / file, ns=(times.st_atime_ns, times.st_mtime_ns))  # a mend that keeps size and time
     with pytest.raises(
-        UserError, match=rf"1 of . objects could not be rendered: {name}: the views in .* are of another"
+        UserError, match=rf"1 of . objects could not be rendered: {name}: the views in .* \(of another mesh"
     ):
         views_of(red, views)
     shutil.rmtree(views / name)

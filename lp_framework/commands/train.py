@@ -29,7 +29,7 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, ModelCheckpoint, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
-from lp_framework.report.page import write_run_page
+from lp_framework.report.page import PAGE, write_run_page
 from lp_framework.viz.curves import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
@@ -61,8 +61,8 @@ def run(config: DictConfig) -> None:
     _check(config)
     if begun:
         last, checkpoint = last_checkpoint(folder)
-        epochs = config.trainer.max_epochs
-        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and (folder / building.TRAINING).is_file():
+        epochs, told = config.trainer.max_epochs, all((folder / name).is_file() for name in (building.TRAINING, PAGE))
+        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and told:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 print(f"skipped, finished before: {folder}")
                 return
@@ -87,8 +87,8 @@ def run(config: DictConfig) -> None:
             keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
     with building.resumable(folder, FOLDER):
         trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
-    if trainer.is_global_zero:
-        report(trainer, folder, config, recipe, data)
+        if trainer.is_global_zero:
+            report(trainer, folder, config, recipe, data)
 
 
 def _saved_config(file: Path, config: DictConfig) -> DictConfig:

@@ -142,12 +142,14 @@ def render_object(
     mesh, settings = fingerprint(scene), asdict(protocol)
     of_files = {} if files is None else {"files": files}
     if folder.exists():
-        if changes := _changes(folder, protocol):
-            raise UserError(f"{folder} was rendered differently ({changes}); choose another folder or delete this one")
-        record = read_record(folder / RECORD)
-        if record.get("mesh") != mesh:
-            other = "of another mesh, or of an earlier version's reading of it"
-            raise UserError(f"the views in {root} are {other}; choose another folder of views or delete them")
+        changes, record = _changes(folder, protocol), read_record(folder / RECORD)
+        if not changes and record.get("mesh") != mesh:
+            changes = "of another mesh, or by an earlier version's reading of it"
+        if changes:  # told once where it is the same for several objects
+            raise UserError(
+                f"the views in {root} were rendered differently ({changes}); choose another folder of "
+                "views or delete them"
+            )
         if files is not None:  # the same mesh in other files
             with written(folder / RECORD) as partial:
                 partial.write_text(json.dumps(record | of_files, indent=1))

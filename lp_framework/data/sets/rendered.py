@@ -217,9 +217,9 @@ class MeshData(RenderedData):
 
     def _parts(self, folder: Path) -> list[Path]:
         """The files below a folder that meshes refer to."""
-        suffixes = {".mtl", ".bin", *Image.registered_extensions()}
-        found = (file for file in folder.rglob("*") if file.suffix.lower() in suffixes and file.is_file())
-        return sorted(file for file in found if not file.is_relative_to(self.path) and file.name[0] != ".")
+        suffixes, views = {".mtl", ".bin", *Image.registered_extensions()}, self.path.resolve()
+        found = (file for file in folder.resolve().rglob("*") if file.suffix.lower() in suffixes and file.is_file())
+        return sorted(file for file in found if not file.is_relative_to(views) and file.name[0] != ".")
 
     def _object(self, name: str) -> MeshObject:
         load, label = self.loader(self.file(name)), self._labels.get(name)
