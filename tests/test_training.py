@@ -368,8 +368,12 @@ def test_a_damaged_configuration_is_named(commands, score, content):
 
 
 def test_resuming_what_is_not_there_is_named(commands):
-    ran = commands.here("nothing", "train", "resume=nowhere")
-    assert ran.error.startswith("resume=nowhere: holds no checkpoints/last.ckpt to go on from")
+    for folder, said in (
+        ("nowhere", "there is no such folder"),
+        ("views", "holds no checkpoints/last.ckpt to go on from"),
+    ):
+        assert commands.here("nothing", "train", f"resume={folder}").error.startswith(f"resume={folder}: {said}")
+        assert not (commands.folder / "nothing").exists()
 
 
 def test_a_resumed_run_keeps_its_settings(commands, score):
