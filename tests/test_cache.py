@@ -457,3 +457,14 @@ def test_images_of_a_folder_have_one_size_but_folders_may_differ(files, tmp_path
     Image.fromarray(draw_view(random_poses(1, "x")[0], 24)).save(files[3])
     message = f"{files[3]}: is 24 x 24 pixels, the other images of its folder are 16 x 16"
     assert refused(files, tmp_path / "cache") == message
+
+
+def test_views_of_16_bits_are_those_of_8(tmp_path):
+    levels = np.random.default_rng(0).integers(0, 256, (8, 8), dtype=np.uint8)
+    for name, pixels in (("eight", levels), ("sixteen", levels.astype(np.uint16) * 257)):
+        (tmp_path / name).mkdir()
+        Image.fromarray(pixels).save(tmp_path / name / "000.png")
+    eight, sixteen = (
+        decoded_views([tmp_path / name / "000.png"], 8, tmp_path / "c")[1] for name in ("eight", "sixteen")
+    )
+    assert np.array_equal(eight, sixteen) and np.array_equal(eight[0, ..., 0], levels)

@@ -23,6 +23,7 @@ from tiny_runs import Commands, Ran
 from lp_framework.commands.train import MetricsLogger
 from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import SHIPPED, find_checkpoint, latest_checkpoint, load_model, read_checkpoint
+from lp_framework.models.pose_model import ScoreModel
 from lp_framework.run_folders import held
 
 EVERYTHING = ("ema=0.9", "model.dropout=0.2", "trainer.max_epochs=6")
@@ -208,6 +209,23 @@ def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
     (commands.folder / "prolonged" / "training.json").unlink()  # as if it had been killed at the very end
     assert commands.here("reported", "train", "resume=prolonged").status == 0
     assert (commands.folder / "prolonged" / "training.json").is_file()
+
+
+def test_ctrl_c_says_how_to_go_on(commands, monkeypatch):
+    begin = ScoreModel.on_train_epoch_start
+
+    def interrupted(self: ScoreModel) -> None:
+        if self.current_epoch == 1:
+            raise KeyboardInterrupt
+        begin(self)
+
+    handler = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        patch.setattr(ScoreModel, "on_train_epoch_start", interrupted)
+        ran = commands.here("interrupted", "train", "trainer.max_epochs=2")
+    signal.signal(signal.SIGINT, handler)  # Lightning has switched it off
+    assert (ran.status, ran.err.splitlines()[-1]) == (130, "interrupted; resume=interrupted goes on")
+    assert commands.here("unused", "train", "resume=interrupted").status == 0
 
 
 @pytest.mark.parametrize("written_by", ["this version", "an earlier one"])

@@ -155,9 +155,12 @@ def run_folder() -> Path:
 
 @contextmanager
 def resumable(folder: Path, kept: str) -> Iterator[None]:
-    """Say of a full disk how the run in `folder` goes on, where its folder `kept` has anything of it."""
+    """Say after Ctrl-C, and of a full disk, how the run in `folder` goes on, where `kept` in it holds something of it."""
     try:
         yield
+    except SystemExit as stop:  # Lightning's, after Ctrl-C
+        goes_on = f"; resume={folder} goes on" if any((folder / kept).glob("*")) else ""
+        raise KeyboardInterrupt(f"interrupted{goes_on}") from stop
     except DiskFull as error:
         if not any((folder / kept).glob("*")):
             raise

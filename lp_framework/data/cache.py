@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import track
 
 from lp_framework.atomic import reason
+from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import on_white, opened, prepare
 from lp_framework.data.views import DEPTH_UNIT
 from lp_framework.errors import UserError
@@ -108,9 +109,8 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
     `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
 
     def decode(image: Image.Image) -> NDArray:
-        return pixels_on_white(
-            prepare(image.convert("RGBA"), str(getattr(image, "filename", "a view"))) if crop else image, size
-        )
+        called = str(getattr(image, "filename", "a view"))
+        return pixels_on_white(prepare(eight_bit(image).convert("RGBA"), called) if crop else image, size)
 
     key = content_key(files, "crops" if crop else "views", size)
     return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))
@@ -118,7 +118,7 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
 
 def pixels_on_white(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """Pixels `[size, size, 3]` of a view, composed over white and resized."""
-    white = Image.fromarray(on_white(image.convert("RGBA")))
+    white = Image.fromarray(on_white(eight_bit(image).convert("RGBA")))
     return np.asarray(white.resize((size, size), Image.Resampling.BOX))
 
 
@@ -126,7 +126,7 @@ def decoded_alpha(files: Sequence[Path], size: int, folder: str | Path, views: s
     """The opacity `[N, size, size]` (uint8) of image files, resized as `decoded_views` does, whose key is `views`."""
 
     def decode(image: Image.Image) -> NDArray:
-        return np.asarray(image.convert("RGBA").getchannel("A").resize((size, size), Image.Resampling.BOX))
+        return np.asarray(eight_bit(image).convert("RGBA").getchannel("A").resize((size, size), Image.Resampling.BOX))
 
     key = content_key([], "alpha", views)
     return cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding alpha"))

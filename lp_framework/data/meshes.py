@@ -76,9 +76,7 @@ class Surface:
     corner_colours: NDArray[np.float32] | None  # [3T, 3]
     texture: NDArray[np.uint8] | None  # [h, w, 3], powers of two, first row on top
     texture_coordinates: NDArray[np.float32] | None  # [3T, 2], v upwards
-    wrap: NDArray[np.int64] | None = (
-        None  # [2], how the texture goes on across and up (OpenGL's numbers); None: repeats
-    )
+    wrap: NDArray[np.int64] | None = None  # [2], how it goes on across and up (OpenGL's numbers); None: repeats
 
 
 def load_scene(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] = ()) -> trimesh.Scene:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from lp_framework.data.cache import cached_array, content_key, depth_files, pixels_on_white, scene_depth, tracked
+from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import EXTENT, SIZE, opened
 from lp_framework.data.views import ObjectViews
 from lp_framework.keyed_random import stable_id
@@ -118,7 +119,7 @@ def decoded_renderings(
             rows = zip(each.files, depth_files(each.files), *seen, strict=True)
             for row, (file, depth, camera, field_of_view) in enumerate(rows):
                 with opened(file) as image, opened(depth) as levels:
-                    pixels = np.asarray(image.convert("RGBA"))
+                    pixels = np.asarray(eight_bit(image).convert("RGBA"))
                     points = _points(scene_depth(levels), camera, field_of_view)
                 random = np.random.default_rng(stable_id(f"{each.name}/{file.name}"))
                 if cropped:

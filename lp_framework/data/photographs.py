@@ -27,6 +27,7 @@ from PIL import Image, ImageOps
 
 from lp_framework.atomic import written
 from lp_framework.data.files import expecting
+from lp_framework.data.images import eight_bit
 from lp_framework.data.masks import HALF, alpha_opacity, mask_maker, mask_opacity, without_strays
 from lp_framework.errors import UserError
 
@@ -43,9 +44,11 @@ EMPTY = "its mask is empty, nothing in it is at least half opaque"
 SHOWN = 5  # names of files in a sentence
 
 
-def photograph_files(images: str | Path | Sequence[str | Path]) -> list[Path]:
+def photograph_files(images: str | Path | Sequence[str | Path] | None) -> list[Path]:
     """The image files of a folder, sorted by name, or those of a list, as given; at least two, or a `UserError`. Warns
     of files in the folder that are not read and may be photographs."""
+    if images is None:
+        raise UserError("images needs a value: a folder, or a list of files, images=[A.png,B.png]")
     if isinstance(images, str | Path):
         folder = Path(images)
         if not folder.is_dir():
@@ -133,12 +136,7 @@ def read_image(file: str | Path) -> Image.Image:
 def upright(image: Image.Image) -> Image.Image:
     """An image of any mode, with 8 bits, turned as its EXIF orientation says: RGBA where it has transparency, else RGB.
     Raises `ValueError` for a mode whose white is not known (floating point)."""
-    image = ImageOps.exif_transpose(image)
-    if image.mode == "F":
-        raise ValueError("its pixels are floating-point numbers; save it with 8 or 16 bits")
-    if image.mode.startswith("I"):  # Pillow's own conversion cuts off above 255
-        levels = np.asarray(image).astype(np.float64).clip(0, 65535) / 257
-        image = Image.fromarray(np.rint(levels).astype(np.uint8))
+    image = eight_bit(ImageOps.exif_transpose(image))
     return image.convert("RGBA" if image.has_transparency_data else "RGB")
 
 
