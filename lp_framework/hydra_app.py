@@ -71,7 +71,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
         return
     _store_plugin_configs(options["config_dir"])
     if options["config_name"] is None:
-        options["multirun"] |= _check_experiment(command, overrides) and not (options["cfg"] or options["info"])
+        said = options["cfg"] or options["info"] or any(each.startswith("hydra.mode=") for each in overrides)
+        options["multirun"] |= _check_experiment(command, overrides) and not said
     failed: list[UserError] = []
     overrides += _in_resumed_folder(overrides)
     with _restored():

@@ -56,7 +56,7 @@ def short(name: str) -> Solver:
 
 def moved(batch: Any, device: torch.device = FAR) -> Any:
     """A dataclass of tensors, on a device."""
-    return type(batch)(*(value.to(device) for value in vars(batch).values()))
+    return type(batch)(*(value if value is None else value.to(device) for value in vars(batch).values()))
 
 
 # ---------------------------------------------------------------- the device itself

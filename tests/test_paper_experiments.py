@@ -23,6 +23,13 @@ CO3D = ("data=co3d", "data.path=co3d_data", "data.scenes=1", "data.train_views=6
 GSO = ("data=gso", "data.path=GSO", *RENDERED)
 
 
+@pytest.fixture(autouse=True)
+def paths(tmp_path):
+    """Where the commands say that data and a trained model are."""
+    (tmp_path / "FOLDER").mkdir()
+    (tmp_path / "runs" / "model").mkdir(parents=True)
+
+
 @pytest.fixture
 def jobs(monkeypatch):
     """The config of every job that `eval` was run with."""

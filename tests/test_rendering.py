@@ -22,6 +22,7 @@ from lp_framework.data.rendering.pyrender_renderer import AutoRenderer, Pyrender
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.data.rendering.renderer import Renderer, View, downsample
 from lp_framework.data.rendering.views import ViewProtocol, render_object, render_objects
+from lp_framework.data.sets import rendered
 from lp_framework.data.sets.rendered import MeshData
 from lp_framework.errors import UserError
 from lp_framework.geometry import camera_to_world, to_ifusion, view_pose
@@ -657,12 +658,12 @@ def test_meshes_that_are_the_same_elsewhere_or_beside_other_files_render_nothing
     views_of(red, views)
     record = json.loads((views / "ply" / "render.json").read_text())
     assert set(record["files"]) == {"content", "stamp"}
-    load = MeshData.load
-    monkeypatch.setattr(MeshData, "load", staticmethod(lambda path: pytest.fail(f"{path} was loaded")))
+    load = rendered.load_scene
+    monkeypatch.setattr(rendered, "load_scene", lambda path, up: pytest.fail(f"{path} was loaded"))
     views_of(red, views, FlatRenderer(fails_at=0))
     red.rename(tmp_path / "moved")
     views_of(tmp_path / "moved", views, FlatRenderer(fails_at=0))
-    monkeypatch.setattr(MeshData, "load", staticmethod(load))
+    monkeypatch.setattr(rendered, "load_scene", load)
     (tmp_path / "moved" / "unused.png").write_bytes(b"not of any mesh")  # the meshes are loaded once, to see so
     for name in ("ply", "obj"):
         older = json.loads((views / name / "render.json").read_text())
@@ -670,7 +671,7 @@ def test_meshes_that_are_the_same_elsewhere_or_beside_other_files_render_nothing
             del older["files"]  # as earlier versions left it
         (views / name / "render.json").write_text(json.dumps(older))
     views_of(tmp_path / "moved", views, FlatRenderer(fails_at=0))
-    monkeypatch.setattr(MeshData, "load", staticmethod(lambda path: pytest.fail(f"{path} was loaded")))
+    monkeypatch.setattr(rendered, "load_scene", lambda path, up: pytest.fail(f"{path} was loaded"))
     views_of(tmp_path / "moved", views, FlatRenderer(fails_at=0))
 
 

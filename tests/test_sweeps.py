@@ -59,6 +59,8 @@ def plain_noise(gamma):
     ],
 )  # fmt: skip
 def test_an_experiment_is_the_sweep_of_a_table(lp, jobs, tmp_path, experiment, narrowed, varies):
+    for name in ("score", "energy"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
     ran = lp("eval", f"experiment={experiment}", "seed=5", *narrowed)  # the command line wins over the experiment
     assert ran.status == 0, ran.err
     keys = {

@@ -25,6 +25,7 @@ from lp_framework.analysis.pairs import PoseMap, ShownPair, View, in_one_scale
 from lp_framework.commands.eval import save_pictures
 from lp_framework.data.pairs import PairData, ViewTable
 from lp_framework.data.views import ObjectViews
+from lp_framework.errors import UserError
 from lp_framework.evaluation.breakdown import breakdown
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.metrics import summarise
@@ -351,7 +352,7 @@ def test_figures_are_saved_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         raise OSError("disk full")
 
     monkeypatch.setattr(Figure, "savefig", fails)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(UserError, match=r"training\.png: cannot be written \(disk full\)"):
         save_figure(figure, tmp_path / "new" / "training")
     assert sorted(tmp_path.glob("new/.*")) == [] and [file.read_bytes() for file in files] == before
 

@@ -155,7 +155,7 @@ def run_folder() -> Path:
 
 @contextmanager
 def resumable(folder: Path, kept: str) -> Iterator[None]:
-    """Say after Ctrl-C, and of a full disk, how the run in `folder` goes on, where `kept` in it holds something of it."""
+    """Say after Ctrl-C, and of a full disk, how the run in `folder` goes on, where `kept` in it holds any of it."""
     try:
         yield
     except SystemExit as stop:  # Lightning's, after Ctrl-C
