@@ -653,6 +653,14 @@ def test_a_mended_mesh_or_material_is_noticed(coloured, tmp_path, file, name):
     views_of(red, views)
 
 
+def test_meshes_with_another_axis_up_are_other_views(coloured, tmp_path):
+    red = coloured("red", (255, 0, 0))
+    data = views_of(red, tmp_path / "views")
+    data.up = "z"
+    with pytest.raises(UserError, match=r"rendered differently \(of another mesh"):
+        data.prepare()
+
+
 def test_meshes_that_are_the_same_elsewhere_or_beside_other_files_render_nothing_anew(coloured, tmp_path, monkeypatch):
     views, red = tmp_path / "views", coloured("red", (255, 0, 0))
     views_of(red, views)
