@@ -352,7 +352,7 @@ def test_files_that_are_no_images(tmp_path: Path):
     for name in ("text.png", "cut.png"):
         with pytest.raises(UserError, match=rf"{name}: is not a readable image \("):
             read_image(tmp_path / name)
-    with pytest.raises(UserError, match="is not a readable image"):
+    with pytest.raises(UserError, match="is a folder; give an image file"):
         read_image(tmp_path)
     floats = saved(Image.fromarray(np.zeros((4, 4), dtype=np.float32)), tmp_path / "float.tif")
     with pytest.raises(

@@ -206,6 +206,7 @@ def test_the_prior_that_ships_draws_the_embedded_objects(lp, tmp_path):
     [
         ("object=tran", "the data have no object 'tran'; did you mean 'tram'? (known: cup, tram, vase)"),
         ("image=nowhere.png", "nowhere.png: there is no such file"),
+        ("image=.", ".: is a folder; give an image file"),
         ("longitudes=0", "longitudes must be a number of them, at least 1, got 0"),
         ("longitudes=2.5", "longitudes must be a number of them, at least 1, got 2.5"),
         ("latitudes_degrees=[]", "latitudes_degrees must list different angles between -180 and 180, got []"),

@@ -94,7 +94,8 @@ def run(config: DictConfig) -> None:
             pictures = []
             if settings["pictures"]:
                 shown = data.data(data.evaluation_split())
-                pictures = save_pictures(folder / "pictures", evaluation, shown, result)
+                with Console(stderr=True).status("drawing pictures"):
+                    pictures = save_pictures(folder / "pictures", evaluation, shown, result)
             print_results(folder, result, pictures)
         kept.finish()
 

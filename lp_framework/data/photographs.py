@@ -112,6 +112,8 @@ def _listed(names: Sequence[str]) -> str:
 @contextmanager
 def opened(file: str | Path) -> Iterator[Image.Image]:
     """An image file, of which only the head has been read; `UserError` naming the file where it cannot be read."""
+    if Path(file).is_dir():
+        raise UserError(f"{file}: is a folder; give an image file")
     with expecting(f"{file}: is not a readable image"), Image.open(file) as image:
         yield image
 
