@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from torch.utils.data import DataLoader
 from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views, tracked
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
 from lp_framework.data.photographic import decoded_renderings
-from lp_framework.data.views import ObjectViews, ViewSource
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, ObjectViews, ViewSource
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import stable_id
 
@@ -110,8 +111,10 @@ class PairDataModule(LightningDataModule):
             self.data(split)
         names = [file.name for file in table.files]
         labels = list(zip(table.names, table.counts, table.ambiguities, table.unique_answer, strict=True))
-        return content_key([], "split", self._image_keys[folder], names, labels, table.cameras.tolist(),
-                           table.field_of_view.tolist())  # fmt: skip
+        angles = table.field_of_view
+        # Of views with the usual one the text stays what it was before others could be told apart.
+        others = [] if (angles == math.radians(FIELD_OF_VIEW_DEGREES)).all() else [angles.tolist()]
+        return content_key([], "split", self._image_keys[folder], names, labels, table.cameras.tolist(), *others)
 
     def _on_disk(self, split: str) -> list[ObjectViews]:
         folder = _folder(split)
