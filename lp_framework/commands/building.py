@@ -158,11 +158,11 @@ def resumable(folder: Path, kept: str) -> Iterator[None]:
     """Say after Ctrl-C, and of a full disk, how the run in `folder` goes on, where `kept` in it holds any of it."""
     try:
         yield
-    except SystemExit as stop:  # Lightning's, after Ctrl-C
-        goes_on = f"; resume={folder} goes on" if any((folder / kept).glob("*")) else ""
-        raise KeyboardInterrupt(f"interrupted{goes_on}") from stop
-    except DiskFull as error:
-        if not any((folder / kept).glob("*")):
+    except (SystemExit, DiskFull) as error:  # Lightning's, after Ctrl-C, and ours
+        begun = any((folder / kept).glob("*"))
+        if isinstance(error, SystemExit):
+            raise KeyboardInterrupt(f"interrupted; resume={folder} goes on" if begun else "interrupted") from error
+        if not begun:
             raise
         raise DiskFull(f"{error}; make room, then resume={folder} goes on") from error
 
