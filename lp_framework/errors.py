@@ -14,13 +14,15 @@ class UserError(ValueError):
     status = 1  # the exit status of a command
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     """`"; did you mean 'x'?"` for the known name closest to `name`, or an empty string when none is close.
+
+    `cutoff` is the least ratio of `difflib.SequenceMatcher` that counts as close, 1 for equal names.
 
     >>> nearest("scor", ["score", "energy"])
     "; did you mean 'score'?"
     """
-    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
     return f"; did you mean '{matches[0]}'?" if matches else ""
 
 

@@ -49,6 +49,9 @@ OF_NO_USE = (
 )
 
 
+SLIP = 0.9  # from which ratio of likeness a name is a known one, misspelt: max_epoch, but not min_epochs
+
+
 class UsageError(UserError):
     """A command line that makes no sense."""
 
@@ -250,16 +253,15 @@ def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
 
 
 def _with_trainer_arguments(overrides: Sequence[str]) -> list[str]:
-    """Arguments of Lightning's Trainer that the YAML files leave out are added, unless they look like a slip."""
+    """Arguments of Lightning's Trainer that the YAML files leave out are added, unless they are but a letter off."""
     files = [catalogue.read(f"trainer/{choice}") for choice in catalogue.choices("trainer")]
     known = {key for file in files for key in file.settings}
-    names = {override: override.partition("=")[0].removeprefix("trainer.") for override in overrides}
-    others = {
-        override
-        for override, name in names.items()
-        if override.startswith("trainer.") and name.isidentifier() and name not in known and not nearest(name, known)
-    }
-    return [f"+{override}" if override in others else override for override in overrides]
+
+    def is_other(override: str) -> bool:
+        group, _, name = override.partition("=")[0].partition(".")
+        return group == "trainer" and name.isidentifier() and name not in known and not nearest(name, known, SLIP)
+
+    return [f"+{override}" if is_other(override) else override for override in overrides]
 
 
 def _usage(message: str) -> NoReturn:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
 import re
 import subprocess
@@ -11,6 +12,7 @@ import types
 from pathlib import Path
 
 import pytest
+from lightning import Trainer
 from omegaconf import OmegaConf
 
 from lp_framework import cli
@@ -105,6 +107,10 @@ def test_every_argument_of_the_trainer_can_be_given(lp):
     ran = lp("train", "trainer.limit_train_batches=20", "trainer.max_epochs=2", "--cfg", "job")
     assert config_of(ran)["trainer"]["limit_train_batches"] == 20
     assert "did you mean 'max_epochs'" in lp("train", "trainer.max_epoch=2").error
+    names = [name for name in inspect.signature(Trainer.__init__).parameters if name != "self"]
+    assert {"max_steps", "min_epochs", "check_val_every_n_epoch"} <= {*names}
+    told = config_of(lp("train", *(f"trainer.{name}=null" for name in names), "--cfg", "job"))["trainer"]
+    assert {*names} <= {*told}
 
 
 @pytest.mark.parametrize("choice", ["solver=langevin,sharp", "solver.gamma=0,1"])
