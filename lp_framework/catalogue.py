@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from lp_framework import registry
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError, among
 
 KEY = re.compile(r"([\w@./-]+):( |$)")
 PACKAGE = re.compile(r"# @package (\S+)")
@@ -136,7 +136,7 @@ def values(group: str, choice: str) -> dict[str, Any]:
 
     known = choices(group)
     if choice not in known:
-        raise UserError(f"there is no {group} '{choice}'{nearest(choice, known)} (known: {', '.join(known)})")
+        raise UserError(f"there is no {group} '{choice}'{among(choice, known)}")
     text = "\n".join(line for lines in read(f"{group}/{choice}").settings.values() for line in lines)
     found: Any = OmegaConf.to_container(OmegaConf.create(text))
     return {str(key): value for key, value in found.items()}

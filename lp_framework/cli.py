@@ -9,7 +9,7 @@ import importlib.metadata
 import os
 import sys
 
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError, among
 
 COMMANDS = {  # the module of a command is lp_framework.commands.NAME
     "train": "Train a score or energy model of the relative pose, or a prior",
@@ -45,8 +45,7 @@ def main() -> int:
         elif command == "--version":
             print(f"lp_framework {importlib.metadata.version('lp_framework')}")
         elif command not in COMMANDS:
-            known = f"{nearest(command, COMMANDS)} (known: {', '.join(COMMANDS)})"
-            print(f"error: there is no command '{command}'{known}", file=sys.stderr)
+            print(f"error: there is no command '{command}'{among(command, COMMANDS)}", file=sys.stderr)
             return 2
         elif command == "plugins":
             from lp_framework.commands import plugins

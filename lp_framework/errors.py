@@ -26,6 +26,16 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     return f"; did you mean '{matches[0]}'?" if matches else ""
 
 
+def among(name: str, known: Iterable[str]) -> str:
+    """What to add to the sentence that `name` is not known: the closest of the known names, and all of them.
+
+    >>> among("scor", ["score", "energy"])
+    "; did you mean 'score'? (known: score, energy)"
+    """
+    names = list(known)
+    return f"{nearest(name, names)} (known: {', '.join(names) or 'none'})"
+
+
 def one_line(error: BaseException) -> str:
     """An error's message in one line, without the lines that OmegaConf and Hydra add for themselves."""
     lines = [line.strip() for line in str(error).splitlines()]

@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError, among, nearest
 
 GROUPS = {  # each with the packages whose import registers its built-in classes
     "model": ("lp_framework.models", "lp_framework.priors"),  # a prior is trained as a model
@@ -108,7 +108,7 @@ def get(group: str, name: str) -> type:
     """The class registered as `group=name`; `UserError` with the known names where there is none."""
     known = names(group)
     if name not in known:
-        raise UserError(f"there is no {group} '{name}'{nearest(name, known)} (known: {', '.join(known) or 'none'})")
+        raise UserError(f"there is no {group} '{name}'{among(name, known)}")
     return _state.classes[group, name][0]
 
 
@@ -145,8 +145,7 @@ def build(group: str, settings: Mapping[str, Any] | str, **components: object) -
     arguments, wanted = parameters(cls)
     for key in values:
         if key not in arguments:
-            known = f"{nearest(key, arguments)} (known: {', '.join(arguments) or 'none'})"
-            raise UserError(f"{group} '{name}': '{key}' is not one of its settings{known}")
+            raise UserError(f"{group} '{name}': '{key}' is not one of its settings{among(key, arguments)}")
     for key, parameter in arguments.items():
         if values.get(key, MISSING if parameter.default is parameter.empty else None) == MISSING:
             raise UserError(f"{group} '{name}' needs a value for '{key}': give {group}.{key}=VALUE")
@@ -281,4 +280,4 @@ def _guarded(origin: str) -> Iterator[None]:
 
 def _check_group(group: str) -> None:
     if group not in GROUPS:
-        raise UserError(f"there is no group '{group}'{nearest(group, GROUPS)} (known: {', '.join(GROUPS)})")
+        raise UserError(f"there is no group '{group}'{among(group, GROUPS)}")

@@ -1,17 +1,14 @@
-"""The harness of `bench`: two contenders at work in turn, and the memory that they take."""
+"""The harness of `bench`: two contenders at work in turn, and the memory that they take on a GPU."""
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch import nn
 
 from lp_framework.clock import now
 
@@ -23,13 +20,12 @@ _Result = TypeVar("_Result")
 class Section:
     """A measurement so far: `rows` by label with their unit, `facts` for the JSON file alone.
 
-    A row has of either contender a value a round, or a single one. `changed` is called after every stretch of work.
+    A row has a value per round of either contender, or a single one.
     """
 
     title: str
     contenders: tuple[str, str]
     device: torch.device
-    changed: Callable[[], None] = lambda: None
     note: str = ""
     rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
@@ -49,7 +45,6 @@ class Section:
                 for work, values in zip(both, self.rows.setdefault(label, ([], [])), strict=True):
                     seconds, amount = timed(work, self.device)
                     values.append(amount / seconds if rate else seconds / amount)
-                    self.changed()
 
     def add(self, label: str, first: float, second: float) -> None:
         """A row of single values."""
@@ -86,50 +81,14 @@ def timed(work: Callable[[], _Result], device: torch.device) -> tuple[float, _Re
     return now(device) - began, result
 
 
-def peak_bytes(work: Callable[[], object], device: torch.device) -> int:
-    """Bytes that the tensors made by some work take at most at once, beyond those that were there before.
-
-    On a GPU PyTorch's allocator counts; on a CPU every operation's results are followed until they are gone, which
-    takes time and leaves out what a kernel needs for itself.
-    """
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-        torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
+def peak_bytes(work: Callable[[], object], weights: nn.Module, device: torch.device) -> int:
+    """The peak of a GPU's memory, in bytes: the weights, and what the work takes. Elsewhere the work is done, and 0."""
+    if device.type != "cuda":
         work()
-        torch.cuda.synchronize(device)
-        return torch.cuda.max_memory_allocated(device) - before
-    with _Storages() as storages:
-        work()
-    return storages.peak
-
-
-class _Storages(TorchDispatchMode):
-    """Counts the bytes of the storages that operators make, from their making to their end."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now = self.peak = 0
-        self.alive: dict[int, int] = {}
-
-    def __torch_dispatch__(
-        self, function: Any, types: Sequence[type], args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None
-    ) -> Any:
-        arguments = {*_storages((args, kwargs))}
-        result = function(*args, **(kwargs or {}))
-        for key, storage in _storages(result).items():
-            if key not in self.alive and key not in arguments:  # else a view, or changed in place
-                self.alive[key] = storage.nbytes()
-                self.now += storage.nbytes()
-                weakref.finalize(storage, self._end, key)
-        self.peak = max(self.peak, self.now)
-        return result
-
-    def _end(self, key: int) -> None:
-        self.now -= self.alive.pop(key)
-
-
-def _storages(tree: Any) -> dict[int, torch.UntypedStorage]:
-    """The memory of the tensors in nested containers, by its address in PyTorch."""
-    storages = [leaf.untyped_storage() for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
-    return {storage._cdata: storage for storage in storages}
+        return 0
+    torch.cuda.synchronize(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    work()
+    torch.cuda.synchronize(device)
+    return torch.cuda.max_memory_allocated(device) - before + sum(each.nbytes for each in weights.parameters())

@@ -18,7 +18,7 @@ from lp_framework.data.meshes import load_scene
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.toy import toy_objects
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError, among
 from lp_framework.geometry import camera_to_world
 
 CONTENDERS = "rendering: views of a mesh file", ("mesh loaded once", "for every view")
@@ -30,8 +30,7 @@ def measure(
     """Views around an embedded object, from a mesh file (GLB); renderers that cannot work are named in the note."""
     objects = {each.name: each for each in toy_objects()}
     if object not in objects:
-        known = f"{nearest(object, objects)} (known: {', '.join(objects)})"
-        raise UserError(f"rendering.object={object} is none of the embedded objects{known}")
+        raise UserError(f"rendering.object={object} is none of the embedded objects{among(object, objects)}")
     mesh, cameras = objects[object].load(), around(views)
     works, missing = {}, []
     with tempfile.TemporaryDirectory() as folder:

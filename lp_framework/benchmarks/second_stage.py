@@ -1,15 +1,14 @@
-"""The second stage: on Zero123 batched against a loop and in reduced precision, and Gauss-Newton against Adam."""
+"""Zero123's part of a pair: batched against a loop, and in reduced precision against plain float32."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Section, timed, worth
+from lp_framework.benchmarks.harness import Section, peak_bytes, timed, worth
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
     Architecture,
@@ -17,33 +16,24 @@ from lp_framework.benchmarks.zero123 import (
     PlainLoop,
     batched,
     encoded,
-    held_bytes,
     looped,
     plain_prior,
     random_pair,
 )
-from lp_framework.data.module import PairDataModule
-from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.priors.zero123.networks import DTYPES
-from lp_framework.solvers.base import Pairs, Solution, pairs_of
-from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
-from lp_framework.solvers.two_stage import GaussNewton, TwoStage
+from lp_framework.solvers.two_stage import TwoStage
 
 BATCHED, LOOP = "batched", "plain loop"
 STEP = "second stage: a step of one pair", (BATCHED, LOOP)
 PAIR = "pair: both stages and encoding", (BATCHED, LOOP)
 PRECISION = "precision: a step of one pair", ("as named", "plain float32")
-DESCENT = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
 SWITCHES = ("channels_last", "compile", "cuda_graph")
-# What both are judged by: the energy under timesteps and noises that neither descends.
-PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
-PROBE_NOISES = 2  # a timestep
-PROBE_SEED = 1  # the solvers' is 0
 
 
 def measure_step(section: Section, computing: Computing, starts: Sequence[int], rounds: int, steps: int) -> None:
@@ -58,8 +48,8 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     ring = {count: Ring(count).make(pair, seed=0) for count in starts}
     loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(starts)][0]]
     # A step of some size is prepared when it is first taken; recorded, it takes its memory then.
-    peaks = {count: held_bytes(batched(ready, pair, poses, 1), batch_prior, device) for count, poses in ring.items()}
-    loop_peak = held_bytes(loops[0].step, loop_prior, device)
+    peaks = {count: peak_bytes(batched(ready, pair, poses, 1), batch_prior, device) for count, poses in ring.items()}
+    loop_peak = peak_bytes(loops[0].step, loop_prior, device)
     for count, peak in peaks.items() if device.type == "cuda" else ():
         section.add(f"{told(count)}, peak memory, GB", peak / 1e9, loop_peak / 1e9)
     section.note = (
@@ -139,7 +129,7 @@ def measure_precision(
     prior = plain.prior(networks)
     codes = prior.encode(pair.images)
     ready = encoded(prior, codes)
-    memory = held_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
+    memory = peak_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
         exact = gradient(ready, pair, poses)
     section.note = f"Zero123's {architecture} size, random weights, {starts} starts"
@@ -147,7 +137,7 @@ def measure_precision(
         other = computing.prior(networks)
         theirs = encoded(other, codes)
         # The first step: once recorded it takes no more memory.
-        its_memory = held_bytes(partial(gradient, theirs, pair, poses), other.unet, device)
+        its_memory = peak_bytes(partial(gradient, theirs, pair, poses), other.unet, device)
         off = ((gradient(theirs, pair, poses) - exact).abs().max() / exact.abs().max()).item()
         section.note += f"; {words}: gradient off by {off:.1g}"
         section.facts[words] = {"gradient_deviation": off}
@@ -162,58 +152,3 @@ def gradient(prior: Prior, pair: Pairs, poses: Tensor) -> Tensor:
     """Of the energies in the poses `[1, N, 3]`."""
     energy, poses = PairEnergy(prior, pair, seed=0), poses.detach().clone().requires_grad_()
     return torch.autograd.grad(energy(poses, TIMESTEP, energy.noise(0)[:, 0]).sum(), poses)[0]
-
-
-def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
-    """So many of the ordered pairs of views, spread evenly over the objects."""
-    every = views.table.pairs("ordered")
-    chosen = every[np.linspace(0, len(every), min(count, len(every)), endpoint=False, dtype=int)]
-    return pairs_of(views[chosen], device)
-
-
-def measure_descent(
-    section: Section, data: PairDataModule, model: PoseModel, prior: Prior, pairs: int, starts: int,
-    gammas: Sequence[float], newton_steps: int, adam_steps: int,
-) -> None:  # fmt: skip
-    """Descents on `pairs` of the test views from where the first stage ends under each of `gammas`.
-
-    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach.
-    """
-    chosen = some_pairs(data.data("test"), pairs, section.device)
-    ready = encoded(prior, prior.encode(chosen.images))
-    newton = GaussNewton(model, ready, refinement_steps=newton_steps, trajectory=True)
-    adam = TwoStage(model, ready, refinement_steps=adam_steps, trajectory=True).second
-    section.note = f"{len(chosen)} pairs of test views, {starts} starts"
-    for gamma in gammas:
-        poses = Ring(starts).make(chosen, seed=0)
-        ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(chosen, poses, seed=0).poses
-        descents = (
-            followed(ready, chosen, newton.refine(chosen, ends, 0), looks=1),
-            followed(ready, chosen, adam.solve(chosen, ends, 0), looks=0),
-        )
-        level = max(min(energies) for energies, _ in descents)
-        steps = [next(step for step, each in enumerate(energies) if each <= level) for energies, _ in descents]
-        reached = [passes[step] for (_, passes), step in zip(descents, steps, strict=True)]
-        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *reached)
-        section.facts[f"gamma {gamma:g}"] = {
-            "energy": {"start": descents[1][0][0], "equal": level},
-            "steps": dict(zip(section.contenders, steps, strict=True)),
-            "energies": {name: each for name, (each, _) in zip(section.contenders, descents, strict=True)},
-        }
-        section.changed()
-
-
-def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
-    """At the start and after each step of a solution: mean energies on the probe, and network passes a start so far.
-
-    Before its first step it has passed the network `looks` times as often as in each.
-    """
-    path = solution.trajectory
-    assert path is not None  # it was asked for
-    energy = PairEnergy(prior, pairs, PROBE_SEED)
-    timesteps = [timestep for timestep in PROBE_TIMESTEPS for _ in range(PROBE_NOISES)]
-    noise = energy.noise(0, len(timesteps))
-    energies = [energy.mean(poses, timesteps, noise).mean().item() for poses in path.unbind(dim=2)]
-    steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
-    passes = (solution.cost.network_passes - len(pairs.images)) / starts  # the images have been encoded before
-    return energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)]

@@ -1,28 +1,32 @@
-"""The first stage batched against a loop, and how cost and memory of both stages grow."""
+"""Both stages with the models that ship: the first one batched against a loop, Gauss-Newton against Adam."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import permutations
-from statistics import median
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Section, Work, peak_bytes, timed, worth
-from lp_framework.errors import UserError
+from lp_framework.benchmarks.harness import Section, Work, worth
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.pairs import PairData
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs, ViewSets
+from lp_framework.solvers.base import Pairs, Solution, pairs_of
 from lp_framework.solvers.langevin import Langevin
+from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
-from lp_framework.solvers.two_stage import TwoStage
+from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
 FIRST_STAGE = "first stage: langevin", ("batched", "plain loop")
-SCALING = "scaling: two_stage", ("most", "fewest")
+DESCENT = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
+# What both are judged by: the energy under timesteps and noises that neither descends.
+PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
+PROBE_NOISES = 2  # a timestep
+PROBE_SEED = 1  # the solvers' is 0
 
 
 @torch.no_grad()
@@ -61,66 +65,58 @@ def measure_first_stage(section: Section, model: PoseModel, views: int, starts: 
 def all_pairs(side: int, views: int, device: torch.device) -> Pairs:
     """All ordered pairs of random images, `side` pixels a side."""
     reference, query = torch.tensor(list(permutations(range(views), 2)), device=device).T
-    return Pairs(random_images(views, side, device), reference, query, torch.arange(len(reference), device=device))
+    images = torch.rand(views, 3, side, side, device=device) * 2 - 1
+    return Pairs(images, reference, query, torch.arange(len(reference), device=device))
 
 
-def random_images(count: int, side: int, device: torch.device) -> Tensor:
-    """Images `[count, 3, side, side]`, the same ones always."""
-    return torch.rand(count, 3, side, side, generator=torch.Generator().manual_seed(0)).to(device) * 2 - 1
+def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
+    """So many of the ordered pairs of views, spread evenly over the objects."""
+    every = views.table.pairs("ordered")
+    chosen = every[np.linspace(0, len(every), min(count, len(every)), endpoint=False, dtype=int)]
+    return pairs_of(views[chosen], device)
 
 
-def measure_scaling(
-    section: Section, model: PoseModel, prior: Prior, pairs: Sequence[int], starts: Sequence[int],
-    views: Sequence[int], fixed: Mapping[str, int], steps: int, rounds: int,
+def measure_descent(
+    section: Section, data: PairDataModule, model: PoseModel, prior: Prior, pairs: int, starts: int,
+    gammas: Sequence[float], newton_steps: int, adam_steps: int,
 ) -> None:  # fmt: skip
-    """Both stages, `steps` steps each, on random images; of pairs, starts and views those that do not grow are `fixed`.
+    """Descents on `pairs` of the test views from where the first stage ends under each of `gammas`.
 
-    A set of views is a first view and so many others, each paired with the first; pairs are sets with one other.
+    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach.
     """
-    solver = TwoStage(model, prior, iterations=steps, refinement_steps=steps)
-    solving = partial(_solving, solver, section.device)
-    works: dict[str, dict[int, Callable[[], object]]] = {
-        "pairs": {size: solving(size, 1, fixed["starts"]) for size in pairs},
-        "starts": {size: solving(fixed["pairs"], 1, size) for size in starts},
-        "views": {size: solving(fixed["sets"], size, fixed["starts"]) for size in views},
-    }
-    for name, sizes in works.items():
-        if len(sizes) < 2:
-            raise UserError(f"scaling.{name} must list two or more numbers, got {list(sizes)}")
-    section.note = f"both stages, {steps} steps each; what does not grow is "
-    section.note += ", ".join(f"{value} {name}" for name, value in fixed.items())
-    section.note += "; cost ~ number^exponent, 1 is linear"
-    for name, sizes in works.items():
-        peaks = {size: peak_bytes(work, section.device) for size, work in sizes.items()}
-        seconds: dict[int, list[float]] = {size: [] for size in sizes}
-        for _ in range(rounds):
-            for size, work in sizes.items():
-                seconds[size].append(timed(work, section.device)[0])
-        medians = {size: median(each) for size, each in seconds.items()}
-        slopes = {"seconds": exponent(medians), "peak_bytes": exponent(peaks)}
-        least, most = min(sizes), max(sizes)
-        label = f"{least} to {most} {name}"
-        section.rows[f"{label}: seconds, exponent {slopes['seconds']:.2f}"] = seconds[most], seconds[least]
-        memory = f"{label}: peak memory, MB, exponent {slopes['peak_bytes']:.2f}"
-        section.add(memory, peaks[most] / 1e6, peaks[least] / 1e6)
-        costs = {size: {"seconds": medians[size], "peak_bytes": peaks[size]} for size in sizes}
-        section.facts[name] = {"sizes": costs, "exponent": slopes}
-        section.changed()
+    chosen = some_pairs(data.data("test"), pairs, section.device)
+    newton = GaussNewton(model, prior, refinement_steps=newton_steps, trajectory=True)
+    adam = TwoStage(model, prior, refinement_steps=adam_steps, trajectory=True).second
+    section.note = f"{len(chosen)} pairs of test views, {starts} starts"
+    for gamma in gammas:
+        poses = Ring(starts).make(chosen, seed=0)
+        ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(chosen, poses, seed=0).poses
+        descents = (
+            followed(prior, chosen, newton.refine(chosen, ends, 0), looks=1),
+            followed(prior, chosen, adam.solve(chosen, ends, 0), looks=0),
+        )
+        level = max(min(energies) for energies, _ in descents)
+        steps = [next(step for step, each in enumerate(energies) if each <= level) for energies, _ in descents]
+        reached = [passes[step] for (_, passes), step in zip(descents, steps, strict=True)]
+        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *reached)
+        section.facts[f"gamma {gamma:g}"] = {
+            "energy": {"start": descents[1][0][0], "equal": level},
+            "steps": dict(zip(section.contenders, steps, strict=True)),
+            "energies": {name: each for name, (each, _) in zip(section.contenders, descents, strict=True)},
+        }
 
 
-def _solving(solver: TwoStage, device: torch.device, sets: int, views: int, starts: int) -> Callable[[], object]:
-    """Solves sets of a first view and so many others."""
-    places = torch.arange(sets * (views + 1), device=device).view(sets, views + 1)
-    images = random_images(places.numel(), solver.prior.image_size, device)
-    problem = ViewSets(images, places, ids=places[:, 0])
-    poses = Ring(starts).make(problem.with_first(), seed=0).unflatten(0, (sets, views))
-    return partial(solver.solve_views, problem, poses, 0)
+def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
+    """At the start and after each step of a solution: mean energies on the probe, and network passes a start so far.
 
-
-def exponent(costs: Mapping[int, float]) -> float:
-    """The slope of log cost over log size, least squares.
-
-    >>> round(exponent({1: 3.0, 10: 30.0, 100: 300.0}), 6)
-    1.0
+    Before its first step it has passed the network `looks` times as often as in each.
     """
-    return float(np.polyfit([math.log(size) for size in costs], [math.log(cost) for cost in costs.values()], 1)[0])
+    path = solution.trajectory
+    assert path is not None  # it was asked for
+    energy = PairEnergy(prior, pairs, PROBE_SEED)
+    timesteps = [timestep for timestep in PROBE_TIMESTEPS for _ in range(PROBE_NOISES)]
+    noise = energy.noise(0, len(timesteps))
+    energies = [energy.mean(poses, timesteps, noise).mean().item() for poses in path.unbind(dim=2)]
+    steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
+    passes = (solution.cost.network_passes - len(pairs.images)) / starts  # those that encode the images are not counted
+    return energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)]

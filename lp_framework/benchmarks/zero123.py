@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, TypeVar
@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor, nn
 
-from lp_framework.benchmarks.harness import Work, peak_bytes, worth
+from lp_framework.benchmarks.harness import Work, worth
 from lp_framework.priors.base import Prior, ViewCode
 from lp_framework.priors.zero123.networks import (
     DTYPES,
@@ -79,14 +79,6 @@ def encoded(prior: _Prior, codes: ViewCode) -> _Prior:
     ready = copy.copy(prior)
     ready.encode = lambda images: codes  # type: ignore[method-assign]
     return ready
-
-
-def held_bytes(work: Callable[[], object], weights: nn.Module, device: torch.device) -> int:
-    """The peak of a GPU's memory, in bytes: the weights, and what the work takes. Elsewhere it is done, and 0."""
-    if device.type != "cuda":
-        work()
-        return 0
-    return peak_bytes(work, device) + sum(each.nbytes for each in weights.parameters())
 
 
 def batched(prior: Prior, pair: Pairs, starts: Tensor, steps: int) -> Work:

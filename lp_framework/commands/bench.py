@@ -19,7 +19,7 @@ from lp_framework import registry
 from lp_framework.benchmarks import batches, rendering, second_stage, stages, zero123
 from lp_framework.benchmarks.harness import Section
 from lp_framework.commands.building import Components, begin, plain, versions
-from lp_framework.errors import UserError, nearest
+from lp_framework.errors import UserError, among
 from lp_framework.evaluation.tables import write_json
 from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.report.paper import paper_table
@@ -33,21 +33,19 @@ MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]]
     "second_stage": (second_stage.measure_step, second_stage.STEP),
     "pair": (second_stage.measure_pair, second_stage.PAIR),
     "precision": (second_stage.measure_precision, second_stage.PRECISION),
-    "adam_gauss_newton": (second_stage.measure_descent, second_stage.DESCENT),
+    "adam_gauss_newton": (stages.measure_descent, stages.DESCENT),
     "rendering": (rendering.measure, rendering.CONTENDERS),
-    "scaling": (stages.measure_scaling, stages.SCALING),
 }
 
 
 def run(config: DictConfig) -> None:
-    """Run the measurements named in `measure`; what has been measured so far is always in `bench.json`."""
+    """Run the measurements named in `measure`; one that is stopped keeps what it has measured in `bench.json`."""
     folder, device, _ = begin(config)
     settings = plain(config)
     names = [settings["measure"]] if isinstance(settings["measure"], str) else settings["measure"]
     for name in names:
         if name not in MEASUREMENTS:
-            known = f"{nearest(str(name), MEASUREMENTS)} (known: {', '.join(MEASUREMENTS)})"
-            raise UserError(f"measure={name} is none of the measurements{known}")
+            raise UserError(f"measure={name} is none of the measurements{among(str(name), MEASUREMENTS)}")
     facts = {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu",
         "threads": torch.get_num_threads(),
@@ -55,25 +53,19 @@ def run(config: DictConfig) -> None:
         "versions": versions(),
     }
     sections: dict[str, Section] = {}
-
-    def save() -> None:
-        write_json(folder / RESULT, {**{name: each.record() for name, each in sections.items()}, **facts})
-
     try:
         for name in names:
             function, (title, contenders) = MEASUREMENTS[name]
             wanted = arguments(name, function, settings, device)
-            section = Section(title, contenders, device, save)
-            sections[name] = section
+            sections[name] = Section(title, contenders, device)
             with Console(stderr=True).status(f"measuring {name}"):
-                function(section, **wanted)
-            save()
+                function(sections[name], **wanted)
             del wanted
             gc.collect()
-            if device.type == "cuda":
-                torch.cuda.empty_cache()
+            torch.cuda.empty_cache()
     finally:
         if sections:
+            write_json(folder / RESULT, {**{name: each.record() for name, each in sections.items()}, **facts})
             show(sections, folder / RESULT)
 
 
@@ -105,7 +97,7 @@ def _settings(settings: Mapping[str, Any], section: str, taker: Callable[..., An
     values = {key: value for key, value in settings[section].items() if key in wanted}
     values = registry.checked(taker, values, f"{section}.")
     for key, value in values.items():
-        each = value if isinstance(value, list) else value.values() if isinstance(value, dict) else [value]
+        each = value if isinstance(value, list) else [value]
         if not each:
             raise UserError(f"{section}.{key} must not be empty")
         if any(isinstance(one, int) and one < 1 and one is not False for one in each):
