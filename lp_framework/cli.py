@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import signal
 import sys
+from typing import NoReturn
 
 from lp_framework.errors import UserError, among
 
@@ -36,7 +38,19 @@ EXAMPLES = {
 
 
 def main() -> int:
-    """Run the command of `sys.argv`; the exit status: 0, 1 for bad input, 2 for a command line that makes no sense."""
+    """Run the command of `sys.argv`.
+
+    Returns the exit status: 0, 1 for bad input, 2 for a command line that makes no sense, 130 after Ctrl-C, and 143
+    after SIGTERM, by which `kill` and schedulers of clusters end a command; it is stopped as by Ctrl-C.
+    """
+    stopped_by = signal.SIGINT
+
+    def terminate(*_: object) -> NoReturn:
+        nonlocal stopped_by
+        stopped_by = signal.SIGTERM
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, terminate)
     command, *arguments = sys.argv[1:] or ["--help"]
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"  # the user asks for tracebacks
     try:
@@ -57,7 +71,7 @@ def main() -> int:
             hydra_app.run(command, arguments)
     except KeyboardInterrupt as stop:
         print(str(stop) or "interrupted", file=sys.stderr)
-        return 130
+        return 128 + stopped_by
     except BrokenPipeError:  # the reader of a pipe, such as head, has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

@@ -197,6 +197,7 @@ def _orderly_console() -> Iterator[None]:
         notes = logging.getLogger(name)
         notes.handlers.clear()  # Hydra's handlers, above it, take over
         notes.propagate = True
+    logging.getLogger("huggingface_hub").propagate = False  # it prints by itself, and would do so twice
     logging.raiseExceptions = False  # a log on a full disk is cut short without a traceback a line
     with warnings.catch_warnings():
         for beginning in OF_NO_USE:

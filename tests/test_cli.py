@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import logging
 import os
 import re
 import subprocess
 import sys
 import types
 from pathlib import Path
+from signal import SIGTERM
 
 import pytest
 from lightning import Trainer
@@ -261,6 +263,23 @@ def test_a_job_that_fails_does_not_stop_a_sweep(lp, jobs, bad, status):
         assert finished.status == status
         assert "job 1 (solver.gamma=2): gamma is 2" in finished.err and "Traceback" not in finished.err
     assert len(jobs) == 3
+
+
+def test_a_command_that_is_stopped_leaves_no_folder_with_nothing_in_it(lp, jobs, walker, monkeypatch):
+    monkeypatch.setattr(sys.modules["lp_framework.commands.train"], "run", lambda _: os.kill(os.getpid(), SIGTERM))
+    assert (lp(*DEMO).status, list((walker / "runs" / "demo").iterdir())) == (143, [])
+
+
+def test_what_the_hub_warns_of_is_printed_once(lp, jobs, monkeypatch):
+    hub = logging.getLogger("huggingface_hub")
+    monkeypatch.setattr(hub, "propagate", True)
+
+    def run(config):
+        monkeypatch.setattr(hub, "handlers", [logging.StreamHandler()])  # as the hub's package does when imported
+        hub.warning("Retrying in 1s")
+
+    monkeypatch.setattr(sys.modules["lp_framework.commands.train"], "run", run)
+    assert lp(*DEMO).err.count("Retrying in 1s") == 1
 
 
 def test_a_job_of_a_sweep_does_not_see_the_ranks_of_the_one_before(lp, jobs, monkeypatch):

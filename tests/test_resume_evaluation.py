@@ -10,7 +10,6 @@ import re
 import shutil
 import signal
 import time
-import zlib
 from pathlib import Path
 
 import pytest
@@ -198,6 +197,25 @@ def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, 
     assert not (commands.folder / "unused").exists()
 
 
+def test_a_command_that_a_scheduler_ends_says_how_it_goes_on(commands, whole, monkeypatch):
+    solve = Evaluation.test_step
+
+    def ended(self: Evaluation, batch, batch_idx: int) -> None:
+        if batch_idx == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        solve(self, batch, batch_idx)
+
+    interrupt = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        patch.setattr(Evaluation, "test_step", ended)
+        ran = commands.here("ended", "eval", *EVALUATION)
+    signal.signal(signal.SIGINT, interrupt)  # Lightning has switched it off
+    assert (ran.status, ran.err.splitlines()[-1]) == (143, "interrupted; resume=ended goes on")
+    ran = commands.here("ended", "eval", *EVALUATION)
+    assert went_on(ran) == 2 * BATCH
+    assert_the_same(ran, whole)
+
+
 def test_sets_of_views_go_on(commands, stop):
     settings = ("views=3", "solver.gamma=0.1")
     wanted = commands.here("sets", "eval", *EVALUATION, *settings)
@@ -232,25 +250,6 @@ def test_results_do_not_outlive_the_beginning_of_others(commands, whole, stop):
 
 
 # ---------------------------------------------------------------- what does not go together
-
-
-def test_an_unfinished_evaluation_of_an_earlier_version_is_refused_in_a_sentence(commands, stop):
-    folder = stop("earlier", 2)
-    rows = [json.loads(line[9:]) for line in journal(folder).read_bytes().splitlines()]
-    for row in rows:
-        del row["probability"]  # as it was written then
-    texts = [json.dumps(row).encode() for row in rows]
-    journal(folder).write_bytes(b"".join(b"%08x %s\n" % (zlib.crc32(text), text) for text in texts))
-    subject = json.loads((folder / "unfinished" / "evaluation.json").read_text())
-    del subject["config"]["data"]["validation_objects"]  # a setting that came later
-    (folder / "unfinished" / "evaluation.json").write_text(json.dumps(subject))
-    for ran in (commands.here("earlier", "eval", *EVALUATION), commands.here("unused", "eval", "resume=earlier")):
-        assert ran.error.endswith("rank_0.jsonl: is of an earlier version of lp_framework; remove earlier/unfinished")
-    del subject["config"]["batch_pairs"]
-    (folder / "unfinished" / "evaluation.json").write_text(json.dumps(subject))
-    assert commands.here("unused", "eval", "resume=earlier").error == (
-        "resume=earlier: is of another version of lp_framework, without batch_pairs; evaluate anew"
-    )
 
 
 def test_another_configuration_is_refused_in_a_sentence_and_nothing_is_lost(commands, stop):

@@ -14,6 +14,8 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from tiny_runs import Commands, Ran
 
+from lp_framework.commands.eval import views_fingerprint
+from lp_framework.data.module import PairDataModule
 from lp_framework.report.paper import paper_tables
 from lp_framework.run_folders import held
 
@@ -115,6 +117,7 @@ def sweep(commands):
     number = sum(each.name.startswith("sweep") for each in commands.folder.iterdir())
 
     def run(*overrides: str) -> Ran:
+        views_fingerprint.cache_clear()  # as in a process of its own
         return commands.here("unused", "eval", *SWEEP, f"hydra.sweep.dir=sweep{number}", *overrides)
 
     run.folder = commands.folder / f"sweep{number}"
@@ -151,13 +154,20 @@ def test_a_sweep_that_is_started_twice_is_shared(sweep):
     assert again.out.count("skipped, finished before: ") == 2 and (sweep.folder / "1" / "results.json").is_file()
 
 
+def test_the_views_of_finished_jobs_are_looked_at_once(sweep, monkeypatch):
+    assert sweep("seed=0,1,2").status == 0
+    fingerprint, looked = PairDataModule.fingerprint, []
+    monkeypatch.setattr(PairDataModule, "fingerprint", lambda *of: looked.append(of) or fingerprint(*of))
+    assert sweep("seed=0,1,2").out.count("skipped, finished before: ") == 3 and len(looked) == 1
+
+
 def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(sweep):
     assert sweep("solver.gamma=0,0.1").status == 0
     before = (sweep.folder / "1" / "results.json").read_bytes()
     again = sweep("solver.gamma=0,0.3,0.5")
     assert again.status == 1
     assert (
-        f"{sweep.folder.name}/1: holds the results of another configuration (solver.gamma is 0.1 there, 0.3 here); "
+        f"{sweep.folder.name}/1: holds other results (solver.gamma is 0.1 there, 0.3 here); "
         "give another hydra.sweep.dir, or remove it"
     ) in again.err
     assert (sweep.folder / "1" / "results.json").read_bytes() == before
@@ -181,7 +191,7 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
     kept = checkpoint.stat()
     os.utime(checkpoint, (time.time() + 60, time.time() + 60))
     try:
-        assert "holds the results of an earlier score/checkpoints/best.ckpt" in sweep("seed=0").err
+        assert "holds other results (score/checkpoints/best.ckpt is newer)" in sweep("seed=0").err
     finally:
         os.utime(checkpoint, (kept.st_atime, kept.st_mtime))
     assert "skipped" in sweep("seed=0").out
@@ -193,7 +203,7 @@ def test_results_of_other_views_are_not_taken(sweep, commands):
     kept = image.read_bytes()
     image.write_bytes((image.parent / "001.png").read_bytes())
     try:
-        assert f"{sweep.folder.name}/0: holds the results of other views; give another" in sweep("seed=0").err
+        assert f"{sweep.folder.name}/0: holds other results (other views); give another" in sweep("seed=0").err
     finally:
         image.write_bytes(kept)
     assert "skipped" in sweep("seed=0").out

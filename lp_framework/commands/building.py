@@ -155,12 +155,13 @@ def run_folder() -> Path:
 
 @contextmanager
 def resumable(folder: Path, kept: str) -> Iterator[None]:
-    """Say after Ctrl-C, and of a full disk, how the run in `folder` goes on, where `kept` in it holds any of it."""
+    """Say of a run that is interrupted, or finds the disk full, how it goes on, where `kept` in its `folder` holds any
+    of it."""
     try:
         yield
-    except (SystemExit, DiskFull) as error:  # Lightning's, after Ctrl-C, and ours
+    except (KeyboardInterrupt, SystemExit, DiskFull) as error:  # Lightning exits after an interruption
         begun = any((folder / kept).glob("*"))
-        if isinstance(error, SystemExit):
+        if not isinstance(error, DiskFull):
             raise KeyboardInterrupt(f"interrupted; resume={folder} goes on" if begun else "interrupted") from error
         if not begun:
             raise

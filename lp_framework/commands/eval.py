@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -51,16 +52,15 @@ def run(config: DictConfig) -> None:
     components = building.Components(settings, checkpoint)
     if "model" in components.needs("solver") and checkpoint is None:
         components.checkpoint = find_checkpoint(settings["checkpoint"])
-    if settings["resume"] is None and is_finished(folder, settings, components):
+    subject: dict[str, Any] = {
+        "config": settings,
+        "checkpoint": str(components.checkpoint) if components.checkpoint else None,
+    }
+    if settings["resume"] is None and is_finished(folder, subject):
         return
     building.warn_of_unused(components)
     solver, starts, data = components["solver"], components["start"], components["data"]
-    subject = {
-        "config": json.loads(json.dumps(settings)),
-        "checkpoint": str(components.checkpoint) if components.checkpoint else None,
-        "weights": building.weights_fingerprint(solver.networks()),
-        "versions": building.versions(),
-    }
+    subject |= {"weights": building.weights_fingerprint(solver.networks()), "versions": building.versions()}
     before = journal.unfinished(folder) if journal.goes_on(folder, subject) else None
     kept = journal.Journal(folder, subject)
     trainer = building.build_trainer(settings["trainer"], folder, [RichProgressBar(leave=False)], logger=[])
@@ -100,35 +100,37 @@ def run(config: DictConfig) -> None:
         kept.finish()
 
 
-def is_finished(folder: Path, settings: Mapping[str, Any], components: building.Components) -> bool:
+def is_finished(folder: Path, subject: Mapping[str, Any]) -> bool:
     """Whether `folder` has the results of this very job of a sweep, of the same views and not older than its
     checkpoint; then says so.
 
     Raises `UserError` for other results, which are not overwritten; a job whose results cannot be read runs.
     """
-    if HydraConfig.get().mode != RunMode.MULTIRUN:
+    file, checkpoint = folder / RESULT, subject["checkpoint"]
+    if HydraConfig.get().mode != RunMode.MULTIRUN or not file.is_file():
         return False
-    file = folder / RESULT
+    chosen = {key: value for key, value in subject["config"].items() if key in ("data", "renderer", "protocol")}
+    now = {**subject, "views": views_fingerprint(json.dumps(chosen))}
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
-        previous, _ = journal.compared_settings(result["config"]), result["fingerprints"]["views"]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        before = {key: result[key] for key in ("config", "checkpoint")} | {"views": result["fingerprints"]["views"]}
+        changed = journal.changes(before, now)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
-    checkpoint = components.checkpoint
-    before = {**previous, "checkpoint": result.get("checkpoint")}
-    now = {**journal.compared_settings(json.loads(json.dumps(settings))), "checkpoint": checkpoint and str(checkpoint)}
-    changed = journal.differences(before, now)
-    advice = "give another hydra.sweep.dir, or remove it"
+    if not changed and checkpoint is not None and Path(checkpoint).stat().st_mtime > file.stat().st_mtime:
+        changed = f"{checkpoint} is newer"
     if changed:
-        said = ", ".join(f"{key} is {there} there, {here} here" for key, (there, here) in list(changed.items())[:3])
-        raise UserError(f"{folder}: holds the results of another configuration ({said}); {advice}")
-    if checkpoint is not None and checkpoint.stat().st_mtime > file.stat().st_mtime:
-        raise UserError(f"{folder}: holds the results of an earlier {checkpoint}; {advice}")
-    data = components.test_views(settings["protocol"])
-    if result["fingerprints"]["views"] != data.fingerprint(data.evaluation_split()):
-        raise UserError(f"{folder}: holds the results of other views; {advice}")
+        raise UserError(f"{folder}: holds other results ({changed}); give another hydra.sweep.dir, or remove it")
     print(f"skipped, finished before: {folder}")
     return True
+
+
+@functools.cache
+def views_fingerprint(settings: str) -> str:
+    """That of the views which settings, as JSON, choose; looked at once for all jobs of a sweep."""
+    chosen = json.loads(settings)
+    data = building.Components(chosen).test_views(chosen["protocol"])
+    return data.fingerprint(data.evaluation_split())
 
 
 def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig, Path | None]:
@@ -139,8 +141,6 @@ def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig,
     if subject is None:
         raise UserError(f"resume={folder}: holds no {journal.FOLDER} evaluation to go on from; give the folder of one")
     previous = OmegaConf.create(subject["config"])
-    if missing := sorted({*config} - {*previous}):
-        raise UserError(f"resume={folder}: is of another version of lp_framework, without {missing[0]}; evaluate anew")
     checkpoint = Path(subject["checkpoint"]) if subject["checkpoint"] else None
     return building.with_overrides(previous, config, journal.MOVABLE, folder / journal.FOLDER), checkpoint
 

@@ -81,8 +81,6 @@ class Journal:
                         name: torch.from_numpy(np.array(value)) if isinstance(value, list) else value
                         for name, value in json.loads(text).items()
                     }
-                    if {*values} != {*SolvedBatch._fields}:
-                        raise UserError(f"{file}: is of an earlier version of lp_framework; remove {self.folder}")
                     yield SolvedBatch(**values)
                 elif line:
                     log.info("%s: line %d is cut short or damaged, its pairs are solved again", file, number + 1)
@@ -104,23 +102,37 @@ def goes_on(folder: Path, subject: Mapping[str, Any]) -> bool:
     before = unfinished(folder)
     if before is None:
         return False
-    changed = differences(_compared(before), _compared({**before, **subject}))
+    changed = changes(before, subject)
     if changed and any((folder / FOLDER).glob("rank_*.jsonl")):
-        said = [  # of a fingerprint nothing but whose it is
-            f"other {key}" if key in ("views", "weights") else f"{key} is {there} there, {here} here"
-            for key, (there, here) in list(changed.items())[:3]
-        ]
         raise UserError(
-            f"{folder}: holds an unfinished evaluation of something else ({', '.join(said)}); "
+            f"{folder}: holds an unfinished evaluation of something else ({changed}); "
             f"give another folder, or remove {folder / FOLDER}"
         )
     return not changed
 
 
-def compared_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of an `eval` by dotted keys on which its results depend, without the checkpoint's path."""
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """In words, what of a subject has changed on which results depend, up to three of it; empty where nothing has.
+
+    What `now` does not hold has not changed, and a setting that one side does not know is off there.
+
+    >>> changes({"config": {"seed": 1, "solver": {"gamma": 0.3}}}, {"config": {"seed": 1, "solver": {"gamma": 0}}})
+    'solver.gamma is 0.3 there, 0 here'
+    """
+    there, here = _compared(before), _compared({**before, **now})
+    said = []
+    for key in sorted({*there, *here}):
+        one, other = there.get(key), here.get(key)
+        if one != other and ((key in there and key in here) or one or other):
+            said.append(f"other {key}" if key in ("views", "weights") else f"{key} is {one} there, {other} here")
+    return ", ".join(said[:3])
+
+
+def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
+    """A subject by dotted keys, without the settings that change no result."""
     left_out = {"plugins", "resume", "checkpoint", *MOVABLE}
-    return {key: value for key, value in dotted(config).items() if key not in left_out}
+    settings = {key: value for key, value in dotted(subject["config"]).items() if key not in left_out}
+    return settings | {key: value for key, value in subject.items() if key not in ("config", "versions")}
 
 
 def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,22 +148,3 @@ def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
         else:
             found[str(key)] = value
     return found
-
-
-def differences(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The keys whose values differ, with both values; a setting that a side does not know is off there, as None is.
-
-    >>> differences({"gamma": 0, "steps": 5}, {"gamma": 0.3, "steps": 5, "depth": False})
-    {'gamma': (0, 0.3)}
-    """
-    both = {key: (ours.get(key), theirs.get(key)) for key in sorted({*ours, *theirs})}
-    return {
-        key: (our, their)
-        for key, (our, their) in both.items()
-        if our != their and ((key in ours and key in theirs) or our or their)
-    }
-
-
-def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
-    others = {key: value for key, value in subject.items() if key not in ("config", "versions")}
-    return compared_settings(subject["config"]) | others
