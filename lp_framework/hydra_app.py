@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -22,19 +22,15 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, errors
 from yaml import YAMLError
 
 from lp_framework import catalogue, registry
-from lp_framework.errors import UserError, nearest, one_line
+from lp_framework.errors import UserError, among, nearest, one_line
 from lp_framework.overrides import with_paths_as_text
 from lp_framework.run_folders import HYDRA, Held, held, relative, remove_if_empty
 
 log = logging.getLogger(__name__)
 
-OPTIONS: dict[str, dict[str, Any]] = {  # Hydra's, as argparse takes them
-    **{option: {"action": "store_true"} for option in ("--help -h", "--hydra-help", "--resolve", "--multirun -m")},
-    **{option: {} for option in ("--config-dir -cd", "--config-name -cn", "--package -p")},
-    "--cfg -c": {"choices": ["job", "hydra", "all"]},
-    "--info -i": {"choices": ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"]},
-}
-
+# Hydra's options.
+FLAGS = ("--help -h", "--hydra-help", "--resolve", "--multirun -m")
+OPTIONS = ("--config-dir -cd", "--config-name -cn", "--package -p", "--cfg -c", "--info -i")
 
 # Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
 OF_NO_USE = (
@@ -47,7 +43,6 @@ OF_NO_USE = (
     r"Checkpoint directory .* exists and is not empty",
     r"Total length of `DataLoader` across ranks is zero",  # an evaluation of which only the tables were missing
 )
-
 
 SLIP = 0.9  # from which ratio of likeness a name is a known one, misspelt: max_epoch, but not min_epochs
 
@@ -112,7 +107,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
                 module = importlib.import_module(f"lp_framework.commands.{command}")
                 with _orderly_console(), held(relative(Path(config.get("resume") or folder))):
                     module.run(config)
-            except (UserError, errors.MissingMandatoryValue, errors.InterpolationResolutionError) as error:
+            except (UserError, errors.InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
                 if sweep and isinstance(error, Held):
                     print(f"skipped, another command is at work on it: {relative(folder)}")
@@ -139,26 +134,23 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
 
 
 def _check_paths(config: DictConfig) -> None:
-    """`UserError` for a file or folder to be read that is not there."""
+    """`UserError` for a value that is missing, and for a file or folder to be read that is not there."""
+    for key in sorted(OmegaConf.missing_keys(config)):
+        raise UserError(f"{key} needs a value: give {key}=VALUE")
     for key in ("images", "image", "masks", "resume", "runs"):
         value = config.get(key)
-        of_files = key == "image" or (key == "images" and isinstance(value, ListConfig))
         for path in value if isinstance(value, ListConfig) else [value]:
             if isinstance(path, str) and not Path(path).exists():
-                raise UserError(
-                    f"{path}: there is no such file" if of_files else f"{key}={path}: there is no such folder"
-                )
+                raise UserError(f"{key}={path}: there is no such file or folder")
     checkpoint = str(config.get("checkpoint"))
     if checkpoint.startswith(("runs/", "./", "../", "/")) and not Path(checkpoint).exists():
-        how = "" if checkpoint.endswith(".ckpt") else f"; to train it: lp train hydra.run.dir={checkpoint}"
-        raise UserError(f"checkpoint={checkpoint}: there is no such run{how}")
-    if "data" not in config or config.get("image") or config.get("images"):  # which are used instead
-        return
-    if OmegaConf.is_missing(config.data, "path"):
-        raise UserError("data.path needs a value: give data.path=FOLDER")
-    of_the_user = registry.MISSING in catalogue.read(f"data/{config.data.name}").settings.get("path", [""])[0]
-    if of_the_user and not Path(config.data.path).exists():
-        raise UserError(f"data.path={config.data.path}: there is no such folder")
+        how = f"to train it: lp train hydra.run.dir={checkpoint}"
+        raise UserError(f"checkpoint={checkpoint}: there is no such file or folder; {how}")
+    path = OmegaConf.select(config, "data.path")
+    if path is not None and not Path(path).exists():
+        (line, *_) = catalogue.read(f"data/{config.data.name}").settings.get("path", [""])
+        if registry.MISSING in line:  # other folders are made
+            raise UserError(f"data.path={path}: there is no such file or folder")
 
 
 def _in_resumed_folder(overrides: Sequence[str]) -> list[str]:
@@ -241,14 +233,18 @@ def _store(group: str, choice: str, file: Path | None) -> None:
 
 def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     """The overrides and Hydra's options, in any order; `UsageError` for an option that does not exist."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.error = _usage  # type: ignore[method-assign]  # a sentence instead of a page and an exit
-    for option, settings in OPTIONS.items():
-        parser.add_argument(*option.split(), **settings)
-    options, overrides = parser.parse_known_args(arguments)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for option in FLAGS:
+        parser.add_argument(*option.split(), action="store_true")
+    for option in OPTIONS:
+        parser.add_argument(*option.split())
+    try:
+        options, overrides = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise UsageError(f"{error} (--help shows the options)") from error
     for override in overrides:
         if override.startswith("-"):
-            known = [name for option in OPTIONS for name in option.split()]
+            known = " ".join([*FLAGS, *OPTIONS]).split()
             raise UsageError(f"there is no option '{override}'{nearest(override.partition('=')[0], known)}")
     return overrides, vars(options)
 
@@ -265,10 +261,6 @@ def _with_trainer_arguments(overrides: Sequence[str]) -> list[str]:
     return [f"+{override}" if is_other(override) else override for override in overrides]
 
 
-def _usage(message: str) -> NoReturn:
-    raise UsageError(f"{message} (--help shows the options)")
-
-
 def _as_words(options: Mapping[str, Any]) -> list[str]:
     """Options as words of a command line."""
     given = {f"--{name.replace('_', '-')}": value for name, value in options.items() if value}
@@ -281,7 +273,9 @@ def _check_experiment(command: str, overrides: Sequence[str]) -> bool:
     for experiment in [override.partition("=")[2] for override in overrides if override.startswith("experiment=")]:
         own = catalogue.experiments(command)
         if experiment not in own and catalogue.find(f"experiment/{experiment}"):
-            raise UsageError(f"experiment={experiment} belongs to another command, not to {command} ({_known(own)})")
+            raise UsageError(
+                f"experiment={experiment} belongs to another command, not to {command} (known: {', '.join(own)})"
+            )
         sweep |= "/sweep" in catalogue.read(f"experiment/{experiment}").defaults
     return sweep
 
@@ -290,21 +284,16 @@ def explain(error: Exception) -> str:
     """What to tell a user of an error that Hydra or OmegaConf raised."""
     cause = error.__cause__ or error.__context__
     match error:
-        case MissingConfigException(missing_cfg_file=str(file)) if file.startswith("hydra/launcher/"):
-            group, _, choice = file.rpartition("/")
-            install = f"pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]'"
-            return f"{group}={choice} is not there ({_known(catalogue.choices(group))}); launchers come with {install}"
         case MissingConfigException(missing_cfg_file=str(file), options=options) if options is not None:
             group, _, choice = file.rpartition("/")
-            failed = "; some plugins could not be loaded, see above" if registry.failures() else ""
-            told = f"there is no {group} '{choice}'{nearest(choice, options)} ({_known(options)}){failed}"
-            return f"{group}={choice}: {told}"
+            told = f"{group}={choice}: there is no {group} '{choice}'{among(choice, options)}"
+            if group == "hydra/launcher":
+                return f"{told}; pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]' brings some"
+            return told + ("; some plugins could not be loaded, see above" if registry.failures() else "")
         case OverrideParseException():
             key, equals, value = error.override.partition("=")
             quoted = f"text with special characters as \"{key}='{value}'\", a list as {key}=[A,B]"
             return f"cannot read '{error.override}': write {quoted if equals else 'KEY=VALUE'}"
-        case errors.MissingMandatoryValue():
-            return f"{error.full_key} needs a value: give {error.full_key}=VALUE"
         case HydraException() if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
             return _place(error) + _unknown_key(cause)
         case HydraException() if isinstance(cause, errors.OmegaConfBaseException):
@@ -332,9 +321,5 @@ def _unknown_key(error: errors.OmegaConfBaseException) -> str:
     siblings = {str(each): value for each, value in node.items()} if isinstance(node, dict) else {}
     inside = [f"{each}.{name}" for each, value in siblings.items() if isinstance(value, dict) and name in value]
     known = list(siblings) if parent else sorted({*siblings, "experiment"} - {"hydra"})
-    hint = f"; did you mean '{inside[0]}'?" if inside else nearest(name, known)
-    return f"{key}: {parent or 'the configuration'} has no '{name}'{hint} ({_known(known)})"
-
-
-def _known(names: Sequence[str]) -> str:
-    return f"known: {', '.join(map(str, names)) or 'none'}"
+    hint = f"; did you mean '{inside[0]}'? (known: {', '.join(known)})" if inside else among(name, known)
+    return f"{key}: {parent or 'the configuration'} has no '{name}'{hint}"

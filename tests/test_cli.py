@@ -127,14 +127,14 @@ def test_an_experiment_that_is_a_sweep_needs_no_option_for_further_values(lp, mo
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("eval", "data=meshes"), "data.path needs a value: give data.path=FOLDER"),
-        (("eval", "data=meshes", "data.path=gone"), "data.path=gone: there is no such folder"),
+        (("eval", "data=meshes"), "data.path needs a value: give data.path=VALUE"),
+        (("eval", "data=meshes", "data.path=gone"), "data.path=gone: there is no such file or folder"),
         (
             ("eval", "checkpoint=runs/gone"),
-            "checkpoint=runs/gone: there is no such run; to train it: lp train hydra.run",
+            "checkpoint=runs/gone: there is no such file or folder; to train it: lp train hydra.run",
         ),
-        (("estimate", "a.png", "b.png"), "a.png: there is no such file"),
-        (("report", "runs=20240101"), "runs=20240101: there is no such folder"),
+        (("estimate", "a.png", "b.png"), "images=a.png: there is no such file or folder"),
+        (("report", "runs=20240101"), "runs=20240101: there is no such file or folder"),
     ],
 )
 def test_missing_files_are_named_before_anything_heavy_is_imported(lp, monkeypatch, arguments, sentence):

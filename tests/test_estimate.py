@@ -224,9 +224,9 @@ def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path)
     [
         ([], "images needs a value: give images=VALUE"),
         (["images=photos/front.png"], "photos/front.png: is one image, two or more are needed"),
-        (["images=[photos/front.png,photos/none.png]"], "photos/none.png: there is no such file"),
+        (["images=[photos/front.png,photos/none.png]"], "images=photos/none.png: there is no such file"),
         (["images=[photos/front.png,photos/broken.png]"], "photos/broken.png: is not a readable image"),
-        (["images=photos", "masks=none"], "masks=none: there is no such folder"),
+        (["images=photos", "masks=none"], "masks=none: there is no such file or folder"),
         (["images=photos", "crop=perhaps"], "crop must be true or false, got perhaps"),
         (["images=photos", "radius=0"], "radius must be a positive number, got 0"),
         (["images=photos", "latitude_degrees=90"], "latitude_degrees must lie between -90 and 90, got 90"),

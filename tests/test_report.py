@@ -348,7 +348,7 @@ def test_several_folders_are_one_report(lp, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("runs=nowhere",), "runs=nowhere: there is no such folder"),
+        (("runs=nowhere",), "runs=nowhere: there is no such file or folder"),
         (("runs=empty",), "runs=empty: holds no finished run to report, nor an unfinished one"),
         (("runs=stopped",), "runs=stopped: holds no finished run to report: stopped/a is unfinished: no res"),
         (

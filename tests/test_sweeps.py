@@ -295,8 +295,8 @@ def test_a_launcher_that_is_not_installed(lp, monkeypatch, launcher, extra):
     monkeypatch.setitem(ConfigStore.instance().repo["hydra"], "launcher", {})
     ran = lp("eval", f"hydra/launcher={launcher}", "--cfg", "job")
     name = {"slurm": "submitit_slurm", "ray_cluster": "ray"}.get(launcher, launcher)
-    assert ran.error.startswith(f"hydra/launcher={name} is not there (known: ")
-    assert ran.error.endswith(f"; launchers come with pip install 'lp_framework[{extra}]'")
+    assert ran.error.startswith(f"hydra/launcher={name}: there is no hydra/launcher '{name}'")
+    assert ran.error.endswith(f"; pip install 'lp_framework[{extra}]' brings some")
 
 
 # A solver of a plugin.

@@ -387,7 +387,7 @@ def test_a_damaged_configuration_is_named(commands, score, content):
 
 def test_resuming_what_is_not_there_is_named(commands):
     for folder, said in (
-        ("nowhere", "there is no such folder"),
+        ("nowhere", "there is no such file or folder"),
         ("views", "holds no checkpoints/last.ckpt to go on from"),
     ):
         assert commands.here("nothing", "train", f"resume={folder}").error.startswith(f"resume={folder}: {said}")

@@ -205,7 +205,7 @@ def test_the_prior_that_ships_draws_the_embedded_objects(lp, tmp_path):
     ("setting", "sentence"),
     [
         ("object=tran", "the data have no object 'tran'; did you mean 'tram'? (known: cup, tram, vase)"),
-        ("image=nowhere.png", "nowhere.png: there is no such file"),
+        ("image=nowhere.png", "image=nowhere.png: there is no such file"),
         ("image=.", ".: is a folder; give an image file"),
         ("longitudes=0", "longitudes must be a number of them, at least 1, got 0"),
         ("longitudes=2.5", "longitudes must be a number of them, at least 1, got 2.5"),
