@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
-from omegaconf import OmegaConf
 from tiny_runs import Commands, Ran
 
 from lp_framework.commands.train import MetricsLogger
@@ -326,21 +325,6 @@ def test_metrics_are_whole_where_the_disk_fills_up(tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == ["metrics.csv"]
 
 
-@pytest.mark.parametrize("cut", ["shortened", "missing"])
-def test_a_last_checkpoint_cut_short_gives_way_to_the_best(commands, score, cut):
-    """What a power cut may leave, or an earlier version of lp_framework."""
-    folder = shutil.copytree(score.folder, commands.folder / cut)
-    last = folder / "checkpoints" / "last.ckpt"
-    contents = last.read_bytes()
-    last.unlink()
-    if cut == "shortened":
-        last.write_bytes(contents[:5000])
-    ran = commands.here(f"after_{cut}", "train", f"resume={cut}", "trainer.max_epochs=4")
-    assert ran.status == 0, ran.err
-    assert re.search(r"WARNING: .*last\.ckpt: .*; going on from .*best\.ckpt", ran.err)
-    assert torch.load(last, weights_only=True)["epoch"] == 3
-
-
 def test_the_same_command_goes_on_in_its_folder_and_another_does_not_write_over_it(commands, score):
     weights = score.checkpoint()["state_dict"]
     assert commands.here("score", "train").error.startswith("score: has done all of its epochs")
@@ -376,13 +360,13 @@ def test_mistakes(commands, setting, sentence):
     assert commands.here("mistake", "train", setting).error.startswith(sentence)
 
 
-@pytest.mark.parametrize("content", ["{", "[1]", "seed: 1"])
+@pytest.mark.parametrize("content", ["{", "[1]"])
 def test_a_damaged_configuration_is_named(commands, score, content):
     folder = shutil.copytree(score.folder, commands.folder / f"damaged_{len(content)}")
     (folder / "config.yaml").write_text(content)
-    sentence = f"{folder.name}/config.yaml: is not the configuration of a training run (missing or damaged)"
-    assert commands.here("onwards", "train", f"resume={folder.name}").error == sentence
-    assert commands.here(folder.name, "train").error == sentence
+    sentence = f"{folder.name}/config.yaml: is missing or damaged ("
+    assert commands.here("onwards", "train", f"resume={folder.name}").error.startswith(sentence)
+    assert commands.here(folder.name, "train").error.startswith(sentence)
 
 
 def test_resuming_what_is_not_there_is_named(commands):
@@ -398,17 +382,6 @@ def test_a_resumed_run_keeps_its_settings(commands, score):
     ran = commands.here("changed", "train", "resume=score", "model.hidden=32")
     assert ran.error == (
         f"model.hidden cannot be changed by a resumed run: {Path('score/config.yaml')} says what it is; leave it out"
-    )
-
-
-def test_a_run_that_held_out_other_views_is_not_resumed(commands, score):
-    folder = shutil.copytree(score.folder, commands.folder / "earlier")
-    saved = OmegaConf.load(folder / "config.yaml")
-    del saved.data["validation_objects"]  # which came with the views that are held out now
-    OmegaConf.save(saved, folder / "config.yaml")
-    assert commands.here("onwards", "train", "resume=earlier", "trainer.max_epochs=4").error == (
-        "resume=earlier: was begun by an earlier version of lp_framework, which held out other views for validation; "
-        "train anew"
     )
 
 

@@ -6,7 +6,6 @@ import csv
 import math
 import shlex
 import shutil
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning import Trainer
 from lightning.pytorch import callbacks
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from yaml import YAMLError
 
 from lp_framework import catalogue, registry
 from lp_framework.atomic import written
@@ -30,6 +28,7 @@ from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, ModelCheckpoint, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.report.page import PAGE, write_run_page
+from lp_framework.report.runs import saved_config
 from lp_framework.viz.curves import save_training_picture
 
 METRICS = "metrics.csv"  # Lightning's name
@@ -39,72 +38,57 @@ OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects",
 def run(config: DictConfig) -> None:
     """Train into this run's folder, or go on in the folder that `resume` names, or where this very run was stopped."""
     folder = building.run_folder() if config.resume is None else Path(config.resume)
-    saved = folder / "config.yaml"
-    begun = any((folder / FOLDER / name).is_file() for name in (LAST, BEST))
-    last, checkpoint = None, None
+    saved, last = folder / "config.yaml", folder / FOLDER / LAST
+    begun = last.is_file()
     if config.resume is not None:
-        if not saved.is_file() or not begun:
+        if not begun:
             raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
-        before = _saved_config(saved, config)
-        if before.data.get("validation_views") and "validation_objects" not in before.data:
-            raise UserError(
-                f"resume={folder}: was begun by an earlier version of lp_framework, which held out other views for "
-                "validation; train anew"
-            )
         # A run may be prolonged or moved to other devices.
-        config = building.with_overrides(before, config, ("trainer",), saved)
-    elif begun and _saved_config(saved, config) != config:  # what was learned is not overwritten
+        config = building.with_overrides(OmegaConf.create(saved_config(saved)), config, ("trainer",), saved)
+    elif begun and saved_config(saved) != building.plain(config):  # what was learned is not overwritten
         raise UserError(
             f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
             "another hydra.run.dir"
         )
-    _check(config)
+    settings = building.plain(config)
+    _check(settings)
+    steps = 0
     if begun:
-        last, checkpoint = last_checkpoint(folder)
-        epochs, told = config.trainer.max_epochs, all((folder / name).is_file() for name in (building.TRAINING, PAGE))
-        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and told:
+        checkpoint, epochs = read_checkpoint(last), settings["trainer"]["max_epochs"]
+        steps = checkpoint["global_step"]
+        reported = all((folder / name).is_file() for name in (building.TRAINING, PAGE))
+        if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and reported:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 print(f"skipped, finished before: {folder}")
                 return
             raise UserError(
                 f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it"
             )
-    recipe = {"model": building.plain(config.model), "backbone": building.plain(config.backbone)}
-    building.seed_run(config.seed)
-    components = building.Components(building.plain(config))
+    building.seed_run(settings["seed"])
+    components = building.Components(settings)
     data, model = components["data"], components["model"]
-    model.recipe = recipe
+    model.recipe = {"model": settings["model"], "backbone": settings["backbone"]}
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
     data.carry(*model.carries)
-    loggers: list[Logger] = [MetricsLogger(folder, name="", version="")]
-    if config.logger.tensorboard:
-        loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))
-    trainer = building.build_trainer(building.plain(config.trainer), folder, chosen_callbacks(config, folder), loggers)
+    metrics = MetricsLogger(folder, name="", version="")
+    boards = [TensorBoardLogger(folder, name="tensorboard", version="")] if settings["logger"]["tensorboard"] else []
+    trainer = building.build_trainer(
+        settings["trainer"], folder, chosen_callbacks(settings, folder), logger=[metrics, *boards]
+    )
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
-        if checkpoint is not None:
-            keep_metrics(trainer, folder / METRICS, checkpoint["global_step"])
+        if begun:
+            keep_metrics(metrics, steps)
     with building.resumable(folder, FOLDER):
-        trainer.fit(model, datamodule=data, ckpt_path=last, weights_only=True if last else None)
+        trainer.fit(model, datamodule=data, ckpt_path=last if begun else None, weights_only=True)
         if trainer.is_global_zero:
-            report(trainer, folder, config, recipe, data)
+            report(trainer, folder, settings, data)
 
 
-def _saved_config(file: Path, config: DictConfig) -> DictConfig:
-    """The config in a run's folder, which has all keys of this one's."""
-    try:
-        saved = OmegaConf.load(file)
-    except (OSError, ValueError, YAMLError):
-        saved = None
-    if not isinstance(saved, DictConfig) or not {*config} <= {*saved}:
-        raise UserError(f"{file}: is not the configuration of a training run (missing or damaged)")
-    return saved
-
-
-def _check(config: DictConfig) -> None:
-    epochs, ema, patience = config.trainer.max_epochs, config.ema, config.patience
-    if epochs == 0:
+def _check(settings: Mapping[str, Any]) -> None:
+    ema, patience = settings["ema"], settings["patience"]
+    if settings["trainer"]["max_epochs"] == 0:
         raise UserError("trainer.max_epochs must be at least 1, got 0")
     if ema is not None and not (isinstance(ema, int | float) and 0 <= ema <= 1):
         raise UserError(f"ema must be a share from 0 to 1, or null for none; got {ema}")
@@ -112,26 +96,14 @@ def _check(config: DictConfig) -> None:
         raise UserError(f"patience must be a number of epochs, or null for no early stop; got {patience}")
 
 
-def last_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
-    """The last checkpoint of the run in `folder`, or its best where the last one was cut short by the run's end."""
-    last, best = folder / FOLDER / LAST, folder / FOLDER / BEST
-    try:
-        return last, read_checkpoint(last)
-    except UserError as error:
-        if not best.is_file():
-            raise
-        warnings.warn(f"{error}; going on from {best}", stacklevel=2)
-        return best, read_checkpoint(best)
-
-
-def chosen_callbacks(config: DictConfig, folder: Path) -> list[callbacks.Callback]:
+def chosen_callbacks(settings: Mapping[str, Any], folder: Path) -> list[callbacks.Callback]:
     """Lightning's own parts: checkpoints (best, last), early stopping, moving average, rates, progress."""
-    validated = config.data.validation_views > 0
+    validated = settings["data"]["validation_views"] > 0
     chosen: list[callbacks.Callback] = [callbacks.LearningRateMonitor("step"), callbacks.RichProgressBar(leave=False)]
-    if config.ema is not None:
-        chosen.append(callbacks.EMAWeightAveraging(decay=config.ema))
-    if validated and config.patience is not None:
-        chosen.append(callbacks.EarlyStopping("val/loss", patience=config.patience))
+    if settings["ema"] is not None:
+        chosen.append(callbacks.EMAWeightAveraging(decay=settings["ema"]))
+    if validated and settings["patience"] is not None:
+        chosen.append(callbacks.EarlyStopping("val/loss", patience=settings["patience"]))
     # A callback each: with `save_last` the last epoch would be kept only where it is the best one, too.
     for file, monitor, mode in ((BEST, "val/loss" if validated else None, "min"), (LAST, "epoch", "max")):
         named: dict[str, Any] = {"filename": Path(file).stem, "monitor": monitor, "mode": mode}
@@ -141,9 +113,10 @@ def chosen_callbacks(config: DictConfig, folder: Path) -> list[callbacks.Callbac
     return chosen
 
 
-def next_command(recipe: Mapping[str, Any], folder: str, data: Mapping[str, Any]) -> str:
+def next_command(settings: Mapping[str, Any], folder: str) -> str:
     """The command that uses the trained model, on the data that it was trained on."""
-    if not issubclass(registry.get("model", recipe["model"]["name"]), PoseModel):
+    data = settings["data"]
+    if not issubclass(registry.get("model", settings["model"]["name"]), PoseModel):
         return f"python -m lp_framework views prior.path={folder}"
     usual = catalogue.values("data", data["name"])
     changed = [
@@ -171,33 +144,31 @@ class MetricsLogger(CSVLogger):
             super().save()
 
 
-def keep_metrics(trainer: Trainer, file: Path, steps: int) -> None:
+def keep_metrics(logger: MetricsLogger, steps: int) -> None:
     """Keep the rows of a run that goes on, up to its checkpoint's step: Lightning would begin the file anew."""
+    file = Path(logger.log_dir) / METRICS
     if not file.is_file():
         return
     with file.open(newline="") as content:
         reader = csv.DictReader(content)
         rows = [list(row.values()) for row in reader if row["step"] and int(row["step"]) < steps]
-    columns = list(reader.fieldnames or ())
-    logger = next(each for each in trainer.loggers if isinstance(each, MetricsLogger))
     with written(file) as partial:
-        write_csv(partial, columns, rows)
-        writer = logger.experiment  # removes `file`
-    writer.metrics_keys = columns
+        write_csv(partial, columns := list(reader.fieldnames or ()), rows)
+        logger.experiment.metrics_keys = columns  # it removes `file` when it is made
 
 
-def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str, Any], data: PairDataModule) -> None:
+def report(trainer: Trainer, folder: Path, settings: Mapping[str, Any], data: PairDataModule) -> None:
     """`TRAINING` and the closing lines; the fingerprint is that of all training views."""
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
+    chosen = {key: settings[key] for key in ("model", "backbone", "seed")}
     write_json(
         folder / building.TRAINING,
-        {**recipe, "seed": config.seed, "epochs": trainer.current_epoch, "steps": trainer.global_step,
-         "final": losses, "objects": data.table("train").names,
-         "fingerprints": {"views": data.fingerprint("all_train")}, "versions": building.versions()},
+        {**chosen, "epochs": trainer.current_epoch, "steps": trainer.global_step, "final": losses,
+         "objects": data.table("train").names, "fingerprints": {"views": data.fingerprint("all_train")},
+         "versions": building.versions()},
     )  # fmt: skip
-    if len(finite) < len(losses):
-        diverged = ", ".join(sorted({*losses} - {*finite}))
+    if diverged := ", ".join(sorted({*losses} - {*finite})):
         raise UserError(f"{folder}: the training has diverged ({diverged}: not finite); lower model.learning_rate")
     console = Console(soft_wrap=True, highlight=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
@@ -205,4 +176,4 @@ def report(trainer: Trainer, folder: Path, config: DictConfig, recipe: dict[str,
     for picture in save_training_picture(folder):
         console.print(f"picture: {picture}")
     console.print(f"page:    {write_run_page(folder, 'train')}")
-    console.print(f"next:    {next_command(recipe, shlex.quote(str(folder)), building.plain(config.data))}")
+    console.print(f"next:    {next_command(settings, shlex.quote(str(folder)))}")
