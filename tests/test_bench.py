@@ -15,10 +15,9 @@ from tiny_runs import Commands
 from view_folders import write_objects
 
 from lp_framework import registry
-from lp_framework.benchmarks import batches, harness, rendering, second_stage, zero123
+from lp_framework.benchmarks import batches, harness, rendering, zero123
 from lp_framework.benchmarks.batches import loss_on, trunk_features
 from lp_framework.benchmarks.harness import Section, peak_bytes
-from lp_framework.benchmarks.second_stage import variant
 from lp_framework.benchmarks.stages import all_pairs, followed, plain_loop, some_pairs
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
@@ -27,6 +26,7 @@ from lp_framework.benchmarks.zero123 import (
     batched,
     encoded,
     plain_prior,
+    variant,
 )
 from lp_framework.commands.bench import MEASUREMENTS, paper_seconds, table
 from lp_framework.data.module import PairDataModule
@@ -56,7 +56,7 @@ FEW = {
     "precision.architecture": "narrow", "precision.starts": "1", "precision.rounds": "1",
     "adam_gauss_newton.pairs": "2", "adam_gauss_newton.starts": "1",
     "adam_gauss_newton.newton_steps": "2", "adam_gauss_newton.adam_steps": "3",
-    "rendering.views": "2", "rendering.resolution": "8", "rendering.rounds": "1",
+    "renderer": "raycast", "rendering.views": "2", "rendering.resolution": "8", "rendering.rounds": "1",
 }  # fmt: skip
 
 
@@ -174,7 +174,7 @@ def steps(monkeypatch):
 
 
 def test_rounds_alternate_and_the_loop_takes_its_starts_in_turn(steps):
-    second_stage.measure_step(section(), Computing("narrow"), [1, 2], rounds=2, steps=2)
+    zero123.measure_step(section(), Computing("narrow"), [1, 2], rounds=2, steps=2)
     warm_up = ["1 of 1", "1 of 2", "at 0"]
     assert steps == [*warm_up, *["2 of 1", *["at 0"] * 2, "2 of 2", *["at 0"] * 2, *["at 180"] * 2] * 2]
 
@@ -182,7 +182,7 @@ def test_rounds_alternate_and_the_loop_takes_its_starts_in_turn(steps):
 def test_seconds_are_those_of_one_step_of_all_starts(steps, monkeypatch):
     monkeypatch.setattr(harness, "timed", lambda work, device: (12.0, work()))
     measured = section()
-    second_stage.measure_step(measured, Computing("narrow"), [1, 2], rounds=1, steps=4)
+    zero123.measure_step(measured, Computing("narrow"), [1, 2], rounds=1, steps=4)
     assert measured.medians() == {"1 start, seconds a step": (3, 3), "2 starts, seconds a step": (3, 3)}
 
 
@@ -354,28 +354,17 @@ def test_a_mesh_that_is_loaded_each_time_looks_the_same(tmp_path):
     assert one.shape == (3, 8, 8, 4) and one[..., 3].any() and np.array_equal(one, other)
 
 
-def test_a_renderer_that_cannot_work_here_is_named():
-    class Broken(RaycastRenderer):
-        def views(self, *arguments):
-            raise UserError("no light")
-
-    both = {"broken": Broken(), "raycast": RaycastRenderer()}
-    measured = section()
-    rendering.measure(measured, "duck", both, 2, 8, 1)
-    assert [*measured.rows] == ["raycast, views a second"] and measured.note.endswith("no light")
-
-
 # ---------------------------------------------------------------- a pair
 
 
 def test_a_pair_is_encoded_once_here_and_at_every_step_of_the_loop(priors, monkeypatch):
     monkeypatch.setattr(Computing, "networks", lambda computing, device: None)
     monkeypatch.setattr(Computing, "prior", lambda computing, networks: priors[0])
-    monkeypatch.setattr(second_stage, "plain_prior", lambda networks: priors[1])
+    monkeypatch.setattr(zero123, "plain_prior", lambda networks: priors[1])
     with Passes(priors[0]) as ours, Passes(priors[1]) as loop:
         model = load_model(SHIPPED / "score")
         measured = section()
-        second_stage.measure_pair(measured, Computing("narrow"), model, paper_seconds(), [2], steps=3, rounds=1)
+        zero123.measure_pair(measured, Computing("narrow"), model, paper_seconds(), [2], steps=3, rounds=1)
     assert ours == {"vae": [2] * 2, "clip": [2] * 2, "unet": [4] * 2 * 3}  # the first pair, and one more
     steps = 1 + 2 * 3  # to warm up, and of either start
     assert loop == {"vae": [2] * 2 * steps, "clip": [2] * steps, "unet": [2] * steps}
@@ -408,7 +397,7 @@ def test_variants_that_are_none(words):
 def test_the_layout_leaves_the_gradient_and_reduced_precision_nearly():
     variants = ["channels_last", "bfloat16"]
     measured = section()
-    second_stage.measure_precision(measured, "narrow", variants, starts=2, rounds=1, steps=1, max_batch=None)
+    zero123.measure_precision(measured, "narrow", variants, starts=2, rounds=1, steps=1, max_batch=None)
     off = {words: facts["gradient_deviation"] for words, facts in measured.facts.items()}
     assert list(off) == variants and off["channels_last"] < 1e-4 and 0 < off["bfloat16"] < 0.2
     assert [*measured.rows] == [f"{words}: seconds a step" for words in off]
@@ -459,7 +448,7 @@ def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
         f"pairs a second, {what}" for what in ("backbone", "prior", "training on a frozen backbone")
     ]
     assert labels["first_stage"] == ["1 pair, starts a second", "2 pairs of 2 images, starts a second"]
-    assert "raycast, views a second" in labels["rendering"]
+    assert labels["rendering"] == ["raycast, views a second"]
     assert labels["pair"] == ["1 start, seconds a pair", "first_pair_seconds"]
     for gamma in ("gamma 0", "gamma 0.3"):
         facts = kept["adam_gauss_newton"][gamma]

@@ -1,10 +1,9 @@
-"""Views a second of the renderers, with a mesh that is loaded once and with one that is loaded for every view."""
+"""Views a second of a renderer, with a mesh that is loaded once and with one that is loaded for every view."""
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -24,27 +23,18 @@ from lp_framework.geometry import camera_to_world
 CONTENDERS = "rendering: views of a mesh file", ("mesh loaded once", "for every view")
 
 
-def measure(
-    section: Section, object: str, renderers: Mapping[str, Renderer], views: int, resolution: int, rounds: int
-) -> None:
-    """Views around an embedded object, from a mesh file (GLB); renderers that cannot work are named in the note."""
+def measure(section: Section, object: str, renderer: Renderer, views: int, resolution: int, rounds: int) -> None:
+    """Views around an embedded object by the chosen renderer, from a mesh file (GLB)."""
     objects = {each.name: each for each in toy_objects()}
     if object not in objects:
         raise UserError(f"rendering.object={object} is none of the embedded objects{among(object, objects)}")
-    mesh, cameras = objects[object].load(), around(views)
-    works, missing = {}, []
+    cameras = around(views)
+    section.note = f"{object}, {views} views of {resolution} x {resolution} pixels"
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{object}.glb"
-        mesh.export(file)
-        for name, renderer in renderers.items():
-            try:
-                renderer.render(mesh, cameras[:1], 8, FIELD_OF_VIEW_DEGREES)
-            except UserError as error:
-                missing.append(str(error))
-                continue
-            once, each_time = (partial(draw, renderer, file, cameras, resolution) for draw in (drawn, drawn_one_by_one))
-            works[f"{name}, views a second"] = worth(views, once), worth(views, each_time)
-        section.note = "; ".join([f"{object}, {views} views of {resolution} x {resolution} pixels", *missing])
+        objects[object].load().export(file)
+        once, each_time = (partial(draw, renderer, file, cameras, resolution) for draw in (drawn, drawn_one_by_one))
+        works = {f"{renderer.name}, views a second": (worth(views, once), worth(views, each_time))}
         section.race(works, rounds, rate=True)
 
 

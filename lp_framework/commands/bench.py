@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from lp_framework import registry
-from lp_framework.benchmarks import batches, rendering, second_stage, stages, zero123
+from lp_framework.benchmarks import batches, rendering, stages, zero123
 from lp_framework.benchmarks.harness import Section
 from lp_framework.commands.building import Components, begin, plain, versions
 from lp_framework.errors import UserError, among
@@ -30,9 +30,9 @@ MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]]
     "loader": (batches.measure_loading, batches.LOADING),
     "encoding": (batches.measure_encoding, batches.ENCODING),
     "first_stage": (stages.measure_first_stage, stages.FIRST_STAGE),
-    "second_stage": (second_stage.measure_step, second_stage.STEP),
-    "pair": (second_stage.measure_pair, second_stage.PAIR),
-    "precision": (second_stage.measure_precision, second_stage.PRECISION),
+    "second_stage": (zero123.measure_step, zero123.STEP),
+    "pair": (zero123.measure_pair, zero123.PAIR),
+    "precision": (zero123.measure_precision, zero123.PRECISION),
     "adam_gauss_newton": (stages.measure_descent, stages.DESCENT),
     "rendering": (rendering.measure, rendering.CONTENDERS),
 }
@@ -81,9 +81,7 @@ def arguments(
         "new_model": lambda: components["model"].to(device),
         "prior": lambda: components["prior"].to(device),
         "data": components.test_views,
-        "renderers": lambda: {
-            each: registry.build("renderer", each) for each in registry.names("renderer") if each != "auto"
-        },
+        "renderer": lambda: components["renderer"],
         "paper_seconds": paper_seconds,
     }
     wanted = inspect.signature(function).parameters
