@@ -16,6 +16,7 @@ import yaml
 
 from lp_framework import registry
 from lp_framework.errors import UserError, among
+from lp_framework.overrides import values_of
 
 KEY = re.compile(r"([\w@./-]+):( |$)")
 PACKAGE = re.compile(r"# @package (\S+)")
@@ -61,8 +62,7 @@ def origin(group: str, choice: str) -> str:
 
 def plugin_folders(overrides: Iterable[str]) -> list[str]:
     """The folders of `plugins=[FOLDER,...]` on a command line."""
-    values = [override.partition("=")[2] for override in overrides if override.startswith("plugins=")]
-    folders = [folder.strip(" '\"") for value in values[-1:] for folder in value.strip("[]").split(",")]
+    folders = (folder.strip(" '\"") for folder in values_of(overrides).get("plugins", "").strip("[]").split(","))
     return [folder for folder in folders if folder]
 
 
@@ -145,10 +145,11 @@ def values(group: str, choice: str) -> dict[str, Any]:
 def command_help(command: str, overrides: Sequence[str], config_dir: str | None = None) -> str:
     """What a command is for, what can be chosen, and each setting with the comment from its YAML file."""
     config = read(command, config_dir)
-    given = dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
+    given = values_of(overrides)
     entries = [entry for entry in config.defaults if isinstance(entry, dict)]
     groups = {group: given.get(group, choice) for entry in entries for group, choice in entry.items()}
-    lines = [f"Usage: lp {command} [key=value ...] [options]", "", config.summary, "", "Choose (group=choice):", ""]
+    lines = [f"Usage: lp {command} [key=value ...] [options]", "", config.summary]
+    lines += ["", "Choose (group=choice):", ""] if groups else []
     for group in groups:
         known = experiments(command, config_dir) if group == "experiment" else choices(group, config_dir)
         lines.append(f"  {group + ':':12}{', '.join(known)}")

@@ -23,14 +23,18 @@ from yaml import YAMLError
 
 from lp_framework import catalogue, registry
 from lp_framework.errors import UserError, among, nearest, one_line
-from lp_framework.overrides import with_paths_as_text
+from lp_framework.overrides import values_of, with_paths_as_text
 from lp_framework.run_folders import HYDRA, Held, held, relative, remove_if_empty
 
 log = logging.getLogger(__name__)
 
-# Hydra's options.
+# Hydra's options, the latter with the values that they take.
 FLAGS = ("--help -h", "--hydra-help", "--resolve", "--multirun -m")
-OPTIONS = ("--config-dir -cd", "--config-name -cn", "--package -p", "--cfg -c", "--info -i")
+OPTIONS = {
+    **dict.fromkeys(("--config-dir -cd", "--config-name -cn", "--package -p")),
+    "--cfg -c": ["job", "hydra", "all"],
+    "--info -i": ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"],
+}
 
 # Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
 OF_NO_USE = (
@@ -68,11 +72,14 @@ def run(command: str, arguments: Sequence[str]) -> None:
         print(catalogue.command_help(options["config_name"] or command, overrides, options["config_dir"]))
         return
     _store_plugin_configs(options["config_dir"])
-    if options["config_name"] is None:
-        said = options["cfg"] or options["info"] or any(each.startswith("hydra.mode=") for each in overrides)
-        options["multirun"] |= _check_experiment(command, overrides) and not said
+    given = values_of(overrides)
+    if options["config_name"] is None and "experiment" in given:
+        told = options["cfg"] or options["info"] or "hydra.mode" in given
+        options["multirun"] |= _is_sweep(command, given["experiment"]) and not told
+    if "resume" in given and (Path(given["resume"].strip("'\"")) / HYDRA).is_dir():
+        # A run goes on in its own folder with its log; Hydra's record there stays as it is.
+        overrides += ["hydra.run.dir=${resume}", "hydra.output_subdir=null"]
     failed: list[UserError] = []
-    overrides += _in_resumed_folder(overrides)
     with _restored():
         sys.argv = [sys.argv[0], *overrides, *_as_words(options)]
         os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions are passed on instead of printed
@@ -153,15 +160,6 @@ def _check_paths(config: DictConfig) -> None:
             raise UserError(f"data.path={path}: there is no such file or folder")
 
 
-def _in_resumed_folder(overrides: Sequence[str]) -> list[str]:
-    """Overrides by which a resumed run goes on in its own folder with its log; Hydra's record there stays as it is."""
-    for override in overrides:
-        key, _, value = override.partition("=")
-        if key == "resume" and (Path(value.strip("'\"")) / HYDRA).is_dir():
-            return ["hydra.run.dir=${resume}", "hydra.output_subdir=null"]
-    return []
-
-
 def _leave_processes() -> None:
     """Leave the process group of a job with several processes: its threads would block the end of this one."""
     distributed = sys.modules.get("torch.distributed")
@@ -199,36 +197,32 @@ def _orderly_console() -> Iterator[None]:
 
 
 def _store_plugin_configs(config_dir: str | None) -> None:
-    """Give Hydra the choices of plugins, but for names of the user's own or the built-in configs, which come first."""
-    folders = registry.conf_folders()
-    choices = dict.fromkeys(registry.plugin_classes())
+    """Give Hydra the choices of plugins, but for names of the user's own or the built-in configs, which come first.
+
+    A plugin's file is stored as it is; where a class is named by a file or has none, all of its settings are.
+    """
+    classes, folders = registry.plugin_classes(), registry.conf_folders()
+    choices = dict.fromkeys(classes)
     for folder in folders:
         files = sorted(folder.rglob("*.yaml"))
         choices |= dict.fromkeys((file.parent.relative_to(folder).as_posix(), file.stem) for file in files)
     for group, choice in choices:
         file = catalogue.find(f"{group}/{choice}", config_dir)
-        if file is None or any(map(file.is_relative_to, folders)):
-            try:
-                _store(group, choice, file)
-            except (YAMLError, ValueError) as error:
-                where = file or f"{group} '{choice}'"
-                print(f"warning: a plugin's configuration is left out: {where}: {one_line(error)}", file=sys.stderr)
-
-
-def _store(group: str, choice: str, file: Path | None) -> None:
-    """A plugin's file as it is; of a file that names a class, and of a class without a file, all of its settings."""
-    values: Any = {}
-    package = None
-    if file is not None:
-        text = file.read_text(encoding="utf-8")
-        values, package = OmegaConf.to_container(OmegaConf.create(text)), catalogue.PACKAGE.search(text)
-        if not isinstance(values, dict):
-            raise ValueError("a configuration is a mapping 'key: value', not a list")
-    name = values.get("name", choice)
-    if (group, name) in (classes := registry.plugin_classes()):
-        shared = {"defaults": [catalogue.SHARED[group], "_self_"]} if group in catalogue.SHARED else {}
-        values = {**shared, "name": name, **catalogue.plugin_defaults(classes[group, name][0]), **values}
-    ConfigStore.instance().store(choice, values, group, package[1] if package else None, provider="plugin")
+        if file is not None and not any(map(file.is_relative_to, folders)):
+            continue
+        try:
+            text = "" if file is None else file.read_text(encoding="utf-8")
+            values: Any = OmegaConf.to_container(OmegaConf.create(text))
+            if not isinstance(values, dict):
+                raise ValueError("a configuration is a mapping 'key: value', not a list")
+            name, package = values.get("name", choice), catalogue.PACKAGE.search(text)
+            if (group, name) in classes:
+                shared = {"defaults": [catalogue.SHARED[group], "_self_"]} if group in catalogue.SHARED else {}
+                values = {**shared, "name": name, **catalogue.plugin_defaults(classes[group, name][0]), **values}
+            ConfigStore.instance().store(choice, values, group, package[1] if package else None, provider="plugin")
+        except (YAMLError, ValueError) as error:
+            where = file or f"{group} '{choice}'"
+            print(f"warning: a plugin's configuration is left out: {where}: {one_line(error)}", file=sys.stderr)
 
 
 def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
@@ -236,8 +230,8 @@ def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for option in FLAGS:
         parser.add_argument(*option.split(), action="store_true")
-    for option in OPTIONS:
-        parser.add_argument(*option.split())
+    for option, choices in OPTIONS.items():
+        parser.add_argument(*option.split(), choices=choices)
     try:
         options, overrides = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
@@ -267,17 +261,13 @@ def _as_words(options: Mapping[str, Any]) -> list[str]:
     return [word for name, value in given.items() for word in ([name] if value is True else [name, value])]
 
 
-def _check_experiment(command: str, overrides: Sequence[str]) -> bool:
-    """Whether the experiment is a sweep; `UsageError` for one that belongs to other commands."""
-    sweep = False
-    for experiment in [override.partition("=")[2] for override in overrides if override.startswith("experiment=")]:
-        own = catalogue.experiments(command)
-        if experiment not in own and catalogue.find(f"experiment/{experiment}"):
-            raise UsageError(
-                f"experiment={experiment} belongs to another command, not to {command} (known: {', '.join(own)})"
-            )
-        sweep |= "/sweep" in catalogue.read(f"experiment/{experiment}").defaults
-    return sweep
+def _is_sweep(command: str, experiment: str) -> bool:
+    """Whether an experiment is a sweep; `UsageError` for one that belongs to other commands."""
+    own = catalogue.experiments(command)
+    if experiment not in own and catalogue.find(f"experiment/{experiment}"):
+        told = f"experiment={experiment} belongs to another command, not to {command}"
+        raise UsageError(f"{told} (known: {', '.join(own)})")
+    return "/sweep" in catalogue.read(f"experiment/{experiment}").defaults
 
 
 def explain(error: Exception) -> str:

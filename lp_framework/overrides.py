@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from lp_framework.errors import UserError
 
@@ -36,6 +36,15 @@ def with_paths_as_text(command: str, overrides: Sequence[str]) -> list[str]:
         raise UserError(f"give the {key} either as {key}=... or as arguments without a key, got both")
     value = _quoted(plain[0]) if len(plain) == 1 else f"[{','.join(map(_quoted, plain))}]"
     return [f"{key}={value}", *keyed] if plain else keyed
+
+
+def values_of(overrides: Iterable[str]) -> dict[str, str]:
+    """What a command line sets each key to, as text; the last value counts.
+
+    >>> values_of(["seed=1", "+solver.gamma=0.3", "~start", "seed=2"])
+    {'seed': '2', 'solver.gamma': '0.3'}
+    """
+    return dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
 
 
 def _as_text(override: str) -> str:

@@ -20,6 +20,7 @@ import importlib
 import importlib.metadata
 import inspect
 import json
+import re
 import sys
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -163,13 +164,10 @@ def component_names(cls: type) -> list[str]:
 
 def parameters(cls: type) -> tuple[dict[str, inspect.Parameter], dict[str, inspect.Parameter]]:
     """The settings and the components of a class's constructor, by name."""
-    named = {
-        key: parameter
-        for key, parameter in inspect.signature(cls).parameters.items()
-        if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
-    }
-    settings = {key: value for key, value in named.items() if key not in GROUPS}
-    return settings, {key: value for key, value in named.items() if key in GROUPS}
+    named = inspect.signature(cls).parameters.items()
+    wanted = {key: each for key, each in named if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+    settings = {key: each for key, each in wanted.items() if key not in GROUPS}
+    return settings, {key: each for key, each in wanted.items() if key in GROUPS}
 
 
 def checked(function: Callable[..., Any], values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
@@ -244,15 +242,15 @@ def _load_plugin(folder: Path) -> None:
     if (place / "__init__.py").exists():
         place, files = place.parent, [place / "__init__.py"]
     modules = {file.parent.name if file.stem == "__init__" else file.stem: file for file in sorted(files)}
-    wanted = [name for name in modules if name not in ("setup", "conftest", "tests") and not name.startswith("test_")]
+    wanted = {name: modules[name] for name in modules if not re.fullmatch("setup|conftest|tests|test_.*", name)}
     with _guarded(f"folder {folder}"):
         if not wanted:
             raise ImportError("it holds no Python module or package")
         if str(place) not in sys.path:
             sys.path.append(str(place))
         importlib.invalidate_caches()
-        for name in wanted:
-            _import(name, modules[name])
+        for name, file in wanted.items():
+            _import(name, file)
 
 
 def _import(name: str, wanted: Path | None = None) -> None:
@@ -267,12 +265,11 @@ def _import(name: str, wanted: Path | None = None) -> None:
 @contextmanager
 def _guarded(origin: str) -> Iterator[None]:
     """Import a plugin: what it registers gets `origin`; when it fails, nothing of it stays but the error."""
-    _state.loading = origin
+    _state.loading, before = origin, (dict(_state.classes), dict(_state.conf_folders))
     try:
         yield
     except (Exception, SystemExit) as error:
-        _state.classes = {key: each for key, each in _state.classes.items() if each[1] != origin}
-        _state.conf_folders = {each: where for each, where in _state.conf_folders.items() if where != origin}
+        _state.classes, _state.conf_folders = before
         _state.failures[origin] = f"{type(error).__name__}: {error}"
     finally:
         _state.loading = None

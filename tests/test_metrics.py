@@ -11,6 +11,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,11 @@ def rows(pairs: int = 60, starts: int = 3, seed: int = 0) -> tuple[torch.Tensor,
     return pair, torch.from_numpy(random.integers(4, size=pairs)), rotation, translation, chosen, answer, probability
 
 
+def objects(names: list[str], ambiguities: list[str], unique_answer: list[bool | None]) -> SimpleNamespace:
+    """What the metrics ask of a table of views."""
+    return SimpleNamespace(names=names, ambiguities=ambiguities, unique_answer=unique_answer)
+
+
 def solved(given: tuple[torch.Tensor, ...]) -> SolvedBatch:
     """A batch of these rows, each of which has taken half a second and three passes."""
     return SolvedBatch(*given, seconds=0.5 * len(given[0]), passes=3 * len(given[0]))
@@ -124,7 +130,7 @@ def solved(given: tuple[torch.Tensor, ...]) -> SolvedBatch:
 
 def fed(given: tuple[torch.Tensor, ...], batch: int = 7) -> PoseMetrics:
     """A metric that got the rows in batches."""
-    metrics = PoseMetrics(NAMES, AMBIGUITIES, UNIQUE)
+    metrics = PoseMetrics(objects(NAMES, AMBIGUITIES, UNIQUE))
     for start in range(0, len(given[0]), batch):
         metrics.update(solved(tuple(each[start : start + batch] for each in given)))
     return metrics
@@ -168,7 +174,7 @@ def test_objects_without_pairs_and_sets_without_labels_have_none():
     assert result["metrics_unique_answer"] is None
     assert result["per_object"]["cup"] is None
     assert result["per_object"]["vase"] == result["metrics"]
-    unlabelled = PoseMetrics(["a"], ["unlabelled"], [None])
+    unlabelled = PoseMetrics(objects(["a"], ["unlabelled"], [None]))
     unlabelled.update(solved((given[0], torch.zeros(5, dtype=torch.long), *given[2:])))
     result = unlabelled.compute()
     assert result["metrics_unique_answer"] is None
@@ -222,6 +228,7 @@ def test_the_mean_over_pairs_counts_a_pair_once_in_double_precision():
 SHARE = """
     import json, pickle, sys
     from pathlib import Path
+    from types import SimpleNamespace
     from lp_framework import torchvision_ops
     torchvision_ops.install()
     import torch
@@ -232,7 +239,8 @@ SHARE = """
     folder, rank = Path(sys.argv[1]), int(sys.argv[2])
     names, ambiguities, unique, given = pickle.loads((folder / "given.pickle").read_bytes())
     torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
-    metrics, mean = PoseMetrics(names, ambiguities, unique), PairMean()
+    table = SimpleNamespace(names=names, ambiguities=ambiguities, unique_answer=unique)
+    metrics, mean = PoseMetrics(table), PairMean()
     batches = [tuple(each[start : start + 8] for each in given) for start in range(0, len(given[0]), 8)]
     assert len(batches) % 2  # so one batch is met twice
     for step in range((len(batches) + 1) // 2):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from lp_framework.benchmarks.harness import Section, Work, worth
 from lp_framework.data.module import PairDataModule
-from lp_framework.data.pairs import BlockSampler, PairBatch
+from lp_framework.data.pairs import PairBatch
 from lp_framework.models.pose_model import DenoisingModel
 from lp_framework.priors.base import Prior
 
@@ -38,7 +39,7 @@ def measure_loading(section: Section, data: PairDataModule, new_model: Denoising
         return work
 
     loaders = feature_space(data), plain_pairs(data)
-    section.note = _told(data, new_model)
+    section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
     kept = [kept_for_backward(new_model, next(batches).to(section.device)) for batches in loaders]  # and a warm-up
     section.add("memory for backward, kB a pair", kept[0] / 1024, kept[1] / 1024)
     works = {"pairs a second": (training(loaders[0]), training(loaders[1]))}
@@ -54,51 +55,40 @@ def measure_encoding(
     against features of both images of every pair at every step. Batches are drawn beforehand.
     """
     once, plain = next(feature_space(data)), next(plain_pairs(data))
-    optimizer = torch.optim.Adam([*new_model.backbone.head.parameters(), *new_model.network.parameters()], lr=0.0)
+    head = new_model.backbone.head
+    optimizer = torch.optim.Adam([*head.parameters(), *new_model.network.parameters()], lr=0.0)
 
     @torch.no_grad()
-    def encode(encoder: Callable[[Tensor], object], batch: PairBatch) -> None:
-        encoder(batch.to(section.device).images)
+    def encoded(encoder: Callable[[Tensor], Tensor], batch: PairBatch) -> Tensor:
+        return encoder(batch.to(section.device).images)
 
     def train(batch: PairBatch, trunk: Callable[[], Tensor]) -> None:
         optimizer.zero_grad()
-        loss_on(new_model, batch.to(section.device), new_model.backbone.head(trunk())).backward()
+        loss_on(new_model, batch.to(section.device), head(trunk())).backward()
         optimizer.step()
 
-    def encoding(encoder: Callable[[Tensor], object]) -> tuple[Work, Work]:
-        first, second = (worth(len(batch), partial(encode, encoder, batch)) for batch in (once, plain))
+    def encoding(encoder: Callable[[Tensor], Any]) -> tuple[Work, Work]:
+        first, second = (worth(len(batch), partial(encoded, encoder, batch)) for batch in (once, plain))
         return first, second
 
-    def features(batch: PairBatch) -> Tensor:
-        return trunk_features(new_model, batch.to(section.device).images)
-
-    kept = features(once)
-    section.note = _told(data, new_model)
-    section.race(
-        {
-            "pairs a second, backbone": encoding(new_model.encode),
-            "pairs a second, prior": encoding(prior.encode),
-            "pairs a second, training on a frozen backbone": (
-                worth(len(once), lambda: train(once, lambda: kept)),
-                worth(len(plain), lambda: train(plain, lambda: features(plain))),
-            ),
-        },
-        rounds,
-        rate=True,
-    )
-
-
-def _told(data: PairDataModule, model: DenoisingModel) -> str:
-    return f"images of {model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
+    trunk = new_model.backbone.trunk
+    kept = encoded(trunk, once)
+    section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
+    works = {
+        "pairs a second, backbone": encoding(new_model.encode),
+        "pairs a second, prior": encoding(prior.encode),
+        "pairs a second, training on a frozen backbone": (
+            worth(len(once), lambda: train(once, lambda: kept)),
+            worth(len(plain), lambda: train(plain, lambda: encoded(trunk, plain))),
+        ),
+    }
+    section.race(works, rounds, rate=True)
 
 
 def feature_space(data: PairDataModule) -> Iterator[PairBatch]:
     """Training batches without end, as the data module gives them."""
-    views = data.data("train")
-    sampler = BlockSampler(views.table, data.batch_pairs, data.block, seed=0)
     while True:
-        for pairs in sampler:
-            yield views[pairs]
+        yield from data.train_dataloader()
 
 
 def plain_pairs(data: PairDataModule) -> Iterator[PairBatch]:
@@ -115,12 +105,6 @@ def two_images_a_pair(batch: PairBatch) -> PairBatch:
     own = {name: getattr(batch, name)[views] for name in ("pixels", "poses", "cameras", "objects")}
     reference = 2 * torch.arange(len(batch))
     return replace(batch, **own, names=[batch.names[view] for view in views], reference=reference, query=reference + 1)
-
-
-@torch.no_grad()
-def trunk_features(model: DenoisingModel, images: Tensor) -> Tensor:
-    """`[I, trunk_dim]` of images `[I, 3, H, W]`, without a graph, as of a frozen trunk."""
-    return model.backbone.trunk(images)
 
 
 def loss_on(model: DenoisingModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:

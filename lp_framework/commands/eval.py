@@ -17,6 +17,7 @@ from rich.console import Console
 
 from lp_framework.analysis.examples import EXAMPLES, gather_examples, save_examples
 from lp_framework.commands import building
+from lp_framework.data.files import read_record
 from lp_framework.data.module import EVALUATION_PAIRS
 from lp_framework.data.pairs import PairData
 from lp_framework.errors import UserError
@@ -61,7 +62,7 @@ def run(config: DictConfig) -> None:
     building.warn_of_unused(components)
     solver, starts, data = components["solver"], components["start"], components["data"]
     subject |= {"weights": building.weights_fingerprint(solver.networks()), "versions": building.versions()}
-    before = journal.unfinished(folder) if journal.goes_on(folder, subject) else None
+    before = journal.begun(folder, subject)
     kept = journal.Journal(folder, subject)
     trainer = building.build_trainer(settings["trainer"], folder, [RichProgressBar(leave=False)], logger=[])
     batch_pairs = pairs_at_once(settings["batch_pairs"], solver, starts)
@@ -107,16 +108,12 @@ def is_finished(folder: Path, subject: Mapping[str, Any]) -> bool:
     Raises `UserError` for other results, which are not overwritten; a job whose results cannot be read runs.
     """
     file, checkpoint = folder / RESULT, subject["checkpoint"]
-    if HydraConfig.get().mode != RunMode.MULTIRUN or not file.is_file():
+    result = read_record(file)
+    if HydraConfig.get().mode != RunMode.MULTIRUN or not {"config", "checkpoint", "fingerprints"} <= {*result}:
         return False
     chosen = {key: value for key, value in subject["config"].items() if key in ("data", "renderer", "protocol")}
-    now = {**subject, "views": views_fingerprint(json.dumps(chosen))}
-    try:
-        result = json.loads(file.read_text(encoding="utf-8"))
-        before = {key: result[key] for key in ("config", "checkpoint")} | {"views": result["fingerprints"]["views"]}
-        changed = journal.changes(before, now)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return False
+    before = {"config": result["config"], "checkpoint": result["checkpoint"], **result["fingerprints"]}
+    changed = journal.changes(before, {**subject, "views": views_fingerprint(json.dumps(chosen))})
     if not changed and checkpoint is not None and Path(checkpoint).stat().st_mtime > file.stat().st_mtime:
         changed = f"{checkpoint} is newer"
     if changed:

@@ -80,12 +80,12 @@ def _recall(error: NDArray) -> dict[str, Any]:
 
 def _intervals(error: NDArray, objects: NDArray) -> dict[str, list[float]]:
     """Rates of objects drawn with replacement: the 2.5% and 97.5% quantiles."""
-    names = np.unique(objects)
+    names, place = np.unique(objects, return_inverse=True)
     drawn = np.random.default_rng(0).integers(len(names), size=(RESAMPLES, len(names)))
-    pairs = np.array([(objects == name).sum() for name in names])[drawn].sum(axis=1)
+    pairs = np.bincount(place)[drawn].sum(axis=1)
     found = {}
     for degrees in THRESHOLDS:
-        right = np.array([(error[objects == name] <= degrees).sum() for name in names])[drawn].sum(axis=1)
+        right = np.bincount(place, error <= degrees)[drawn].sum(axis=1)
         found[f"R(R)@{degrees}"] = [float(each) for each in np.quantile(right / pairs, (0.025, 0.975))]
     return found
 

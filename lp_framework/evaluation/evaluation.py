@@ -71,7 +71,7 @@ class Evaluation(LightningModule):
     def gather_for(self, table: ViewTable) -> None:
         """Start with no results, for pairs of the views in `table`."""
         self.table = table
-        self.metrics = PoseMetrics(table.names, table.ambiguities, table.unique_answer, self.solver.one_answer)
+        self.metrics = PoseMetrics(table, self.solver.one_answer)
 
     def solve(self, batch: PairBatch) -> Solution:
         """The solver's solution of a batch's pairs, or of its sets as one of those pairs."""

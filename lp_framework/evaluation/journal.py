@@ -10,7 +10,6 @@ match its checksum, and its pairs are solved again. JSON keeps every bit of a nu
 from __future__ import annotations
 
 import json
-import logging
 import os
 import shutil
 import zlib
@@ -22,11 +21,10 @@ import numpy as np
 import torch
 
 from lp_framework.atomic import writing
+from lp_framework.data.files import read_record
 from lp_framework.errors import UserError
 from lp_framework.evaluation.metrics import SolvedBatch
 from lp_framework.evaluation.tables import RESULT, write_text
-
-log = logging.getLogger(__name__)
 
 FOLDER = "unfinished"
 SUBJECT = "evaluation.json"
@@ -44,7 +42,7 @@ class Journal:
         """What has been solved before, of data with the fingerprint `views`; else the journal is begun and the results
         of a finished evaluation are removed. `UserError` for a journal of another one."""
         now = {**self.subject, "views": views}
-        if goes_on(self.run, now):
+        if begun(self.run, now) is not None:
             return list(self._read())
         shutil.rmtree(self.folder, ignore_errors=True)
         (self.run / RESULT).unlink(missing_ok=True)
@@ -73,7 +71,7 @@ class Journal:
 
     def _read(self) -> Iterator[SolvedBatch]:
         for file in sorted(self.folder.glob("rank_*.jsonl")):
-            for number, line in enumerate(file.read_bytes().split(b"\n")):
+            for line in file.read_bytes().split(b"\n"):
                 checksum, _, text = line.partition(b" ")
                 if checksum == b"%08x" % zlib.crc32(text):
                     # Of lists, which NumPy gives the 64 bits that their numbers have.
@@ -82,33 +80,26 @@ class Journal:
                         for name, value in json.loads(text).items()
                     }
                     yield SolvedBatch(**values)
-                elif line:
-                    log.info("%s: line %d is cut short or damaged, its pairs are solved again", file, number + 1)
 
 
 def unfinished(folder: Path) -> dict[str, Any] | None:
     """What the unfinished evaluation in a run's folder is of, None where there is none."""
-    try:
-        subject: dict[str, Any] = json.loads((folder / FOLDER / SUBJECT).read_text(encoding="utf-8"))
-        whole = isinstance(subject["config"], dict) and isinstance(subject["checkpoint"], str | None)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+    subject = read_record(folder / FOLDER / SUBJECT)
+    whole = isinstance(subject.get("config"), dict) and isinstance(subject.get("checkpoint", ...), str | None)
     return subject if whole else None
 
 
-def goes_on(folder: Path, subject: Mapping[str, Any]) -> bool:
-    """Whether the unfinished evaluation in `folder` is of this subject, or part of one; False where there is none,
-    `UserError` for another one that has solved anything."""
+def begun(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What `unfinished` says where it is of this subject, or more than it; None where there is none, `UserError` for
+    another one that has solved anything."""
     before = unfinished(folder)
-    if before is None:
-        return False
-    changed = changes(before, subject)
+    changed = "" if before is None else changes(before, subject)
     if changed and any((folder / FOLDER).glob("rank_*.jsonl")):
         raise UserError(
             f"{folder}: holds an unfinished evaluation of something else ({changed}); "
             f"give another folder, or remove {folder / FOLDER}"
         )
-    return not changed
+    return None if changed else before
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
+from lp_framework.data.pairs import ViewTable
 from lp_framework.models.pair_mean import HostMetric, first_of_each
 
 ROTATION_THRESHOLDS = (5, 15, 30)  # degrees
@@ -59,22 +59,15 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
 
 
 class PoseMetrics(HostMetric):
-    """Gathers a row a pair. `names`, `ambiguities` and `unique_answer` (None: unknown) describe the objects by index; a
-    solver with `one_answer` a pair has no success rates over starts."""
+    """Gathers a row a pair of the views in `table`; a solver with `one_answer` a pair has no success rates over
+    starts."""
 
     batch: list[Tensor]  # the first pair of each
     cost: list[Tensor]  # pairs, seconds, passes of each batch
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        ambiguities: Sequence[str],
-        unique_answer: Sequence[bool | None],
-        one_answer: bool = False,
-    ) -> None:
+    def __init__(self, table: ViewTable, one_answer: bool = False) -> None:
         super().__init__()
-        self.names, self.ambiguities, self.unique_answer = names, ambiguities, unique_answer
-        self.one_answer = one_answer
+        self.table, self.one_answer = table, one_answer
         for state in (*STATES, "batch", "cost"):
             self.add_state(state, [], dist_reduce_fx="cat")
         self._rows: dict[str, Tensor] = {}
@@ -110,15 +103,15 @@ class PoseMetrics(HostMetric):
         def rows_of(objects: list[bool]) -> Tensor:
             return torch.tensor(objects)[rows["object"]].nonzero().flatten()
 
-        counts = torch.bincount(rows["object"], minlength=len(self.names))
+        counts = torch.bincount(rows["object"], minlength=len(self.table.names))
         of_each = rows["object"].argsort(stable=True).split(counts.tolist())  # the rows of each object
-        classes = sorted(set(self.ambiguities), key=["unique", "twofold", "continuous", "unlabelled"].index)
+        classes = sorted(set(self.table.ambiguities), key=["unique", "twofold", "continuous", "unlabelled"].index)
         return {
             "metrics": over(torch.arange(len(rows["pair"]))),
-            "metrics_unique_answer": over(rows_of([answer is True for answer in self.unique_answer])),
-            "per_object": {name: over(chosen) for name, chosen in zip(self.names, of_each, strict=True)},
+            "metrics_unique_answer": over(rows_of([answer is True for answer in self.table.unique_answer])),
+            "per_object": {name: over(chosen) for name, chosen in zip(self.table.names, of_each, strict=True)},
             "per_ambiguity": {
-                name: over(rows_of([ambiguity == name for ambiguity in self.ambiguities])) for name in classes
+                name: over(rows_of([ambiguity == name for ambiguity in self.table.ambiguities])) for name in classes
             },
             "unanswered": rows["rotation"].gather(1, rows["chosen"][:, None]).isnan().double().mean().item(),
             "pairs": len(rows["pair"]),

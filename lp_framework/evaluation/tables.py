@@ -17,7 +17,7 @@ from rich.table import Table
 
 from lp_framework.atomic import written
 from lp_framework.data.pairs import ViewTable
-from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, PoseMetrics
+from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, STATES, PoseMetrics
 
 RESULT = "results.json"  # of a finished evaluation
 COLUMNS = [f"{prefix}@{degrees}" for prefix in ("R", "R(R)", "SR", "SR(R)") for degrees in ROTATION_THRESHOLDS]
@@ -117,14 +117,11 @@ def pair_rows(metrics: PoseMetrics, table: ViewTable) -> list[list[object]]:
     """A row a pair with the answer (relative pose, degrees) and its errors."""
     rows = metrics.rows()
     lines: list[list[object]] = []
-    for line in range(len(rows["pair"])):
-        reference, query = rows["pair"][line].tolist()
-        index, chosen = int(rows["object"][line]), int(rows["chosen"][line])
-        latitude, longitude, radius = rows["answer"][line].tolist()
-        errors = [round(float(rows[key][line, chosen]), 5) for key in ("rotation", "translation")]
+    for solved in zip(*(rows[state].tolist() for state in STATES), strict=True):
+        views, index, rotation, translation, chosen, (latitude, longitude, radius), probability = solved
+        files = [table.files[view].name for view in views]
+        errors = [round(each[chosen], 5) for each in (rotation, translation)]
         pose = [round(math.degrees(latitude), 4), round(math.degrees(longitude), 4), round(radius, 5)]
-        files = [table.files[reference].name, table.files[query].name]
-        probability = float(rows["probability"][line])
         sure = "" if math.isnan(probability) else round(probability, 4)
         lines.append([table.names[index], table.ambiguities[index], *files, *errors, chosen, *pose, sure])
     return lines
