@@ -61,7 +61,7 @@ FEW = {
 
 
 def section():
-    return Section("a", ("new", "old"), CPU)
+    return Section(CPU, "a", ("new", "old"))
 
 
 @pytest.fixture(scope="module")
@@ -437,7 +437,7 @@ def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
     kept = ran.json("bench.json")
     assert list(kept) == [*MEASUREMENTS, "device", "threads", "config", "versions"]
     for row in ("pairs a second", "memory for backward, kB a pair"):
-        one, other = (kept["loader"][row][name]["median"] for name in batches.LOADING[1])
+        one, other = (kept["loader"][row][name]["median"] for name in ("pairs in feature space", "plain pair loader"))
         assert kept["loader"][row]["ratio"] == pytest.approx(one / other)
     assert kept["loader"]["memory for backward, kB a pair"]["ratio"] < 1
     assert ran.out.index("pairs a second") < ran.out.index("1 start, seconds a step")

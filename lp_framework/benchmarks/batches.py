@@ -17,12 +17,10 @@ from lp_framework.data.pairs import PairBatch
 from lp_framework.models.pose_model import DenoisingModel
 from lp_framework.priors.base import Prior
 
-LOADING = "loader: a training step", ("pairs in feature space", "plain pair loader")
-ENCODING = "encoding: the images of pairs", ("each view once", "two images a pair")
-
 
 def measure_loading(section: Section, data: PairDataModule, new_model: DenoisingModel, rounds: int, steps: int) -> None:
     """Training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
+    section.title, section.contenders = "loader: a training step", ("pairs in feature space", "plain pair loader")
     optimizer = torch.optim.Adam(new_model.parameters(), lr=0.0)  # the weights stay, so every step does the same work
 
     def training(batches: Iterator[PairBatch]) -> Work:
@@ -54,6 +52,7 @@ def measure_encoding(
     The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
     against features of both images of every pair at every step. Batches are drawn beforehand.
     """
+    section.title, section.contenders = "encoding: the images of pairs", ("each view once", "two images a pair")
     once, plain = next(feature_space(data)), next(plain_pairs(data))
     head = new_model.backbone.head
     optimizer = torch.optim.Adam([*head.parameters(), *new_model.network.parameters()], lr=0.0)

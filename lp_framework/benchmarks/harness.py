@@ -20,12 +20,13 @@ _Result = TypeVar("_Result")
 class Section:
     """A measurement so far: `rows` by label with their unit, `facts` for the JSON file alone.
 
-    A row has a value per round of either contender, or a single one.
+    A row has a value per round of either contender, or a single one. The measurement sets the title, the contenders'
+    names and the note.
     """
 
-    title: str
-    contenders: tuple[str, str]
     device: torch.device
+    title: str = ""
+    contenders: tuple[str, str] = ("first", "second")
     note: str = ""
     rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)

@@ -20,8 +20,6 @@ from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError, among
 from lp_framework.geometry import camera_to_world
 
-CONTENDERS = "rendering: views of a mesh file", ("mesh loaded once", "for every view")
-
 
 def measure(section: Section, object: str, renderer: Renderer, views: int, resolution: int, rounds: int) -> None:
     """Views around an embedded object by the chosen renderer, from a mesh file (GLB)."""
@@ -29,6 +27,7 @@ def measure(section: Section, object: str, renderer: Renderer, views: int, resol
     if object not in objects:
         raise UserError(f"rendering.object={object} is none of the embedded objects{among(object, objects)}")
     cameras = around(views)
+    section.title, section.contenders = "rendering: views of a mesh file", ("mesh loaded once", "for every view")
     section.note = f"{object}, {views} views of {resolution} x {resolution} pixels"
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{object}.glb"

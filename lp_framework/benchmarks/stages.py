@@ -21,8 +21,6 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
-FIRST_STAGE = "first stage: langevin", ("batched", "plain loop")
-DESCENT = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
 # What both are judged by: the energy under timesteps and noises that neither descends.
 PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
 PROBE_NOISES = 2  # a timestep
@@ -48,6 +46,7 @@ def plain_loop(solver: Langevin, pairs: Pairs, starts: Tensor) -> Tensor:
 
 def measure_first_stage(section: Section, model: PoseModel, views: int, starts: int, rounds: int) -> None:
     """On all ordered pairs of `views` random images, `starts` each, and on one of these pairs."""
+    section.title, section.contenders = "first stage: langevin", ("batched", "plain loop")
     solver = Langevin(model)
 
     def works(pairs: Pairs) -> tuple[Work, Work]:
@@ -84,6 +83,7 @@ def measure_descent(
 
     A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach.
     """
+    section.title, section.contenders = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
     chosen = some_pairs(data.data("test"), pairs, section.device)
     newton = GaussNewton(model, prior, refinement_steps=newton_steps, trajectory=True)
     adam = TwoStage(model, prior, refinement_steps=adam_steps, trajectory=True).second

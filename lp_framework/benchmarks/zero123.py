@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -33,12 +33,8 @@ from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.twist import IFusion, SineRadius, TwistPoses
 from lp_framework.solvers.two_stage import TwoStage
 
-_Prior = TypeVar("_Prior", bound=Prior)
 TIMESTEP = 500  # the work is that of any other
-BATCHED, LOOP = "batched", "plain loop"
-STEP = "second stage: a step of one pair", (BATCHED, LOOP)
-PAIR = "pair: both stages and encoding", (BATCHED, LOOP)
-PRECISION = "precision: a step of one pair", ("as named", "plain float32")
+CONTENDERS = BATCHED, LOOP = "batched", "plain loop"
 SWITCHES = ("channels_last", "compile", "cuda_graph")
 
 Architecture = Literal["published", "narrow"]
@@ -84,7 +80,7 @@ def random_pair(device: torch.device) -> Pairs:
     return Pairs(torch.rand(2, 3, IMAGE_SIZE, IMAGE_SIZE, device=device) * 2 - 1, index[:1], index[1:], ids=index[:1])
 
 
-def encoded(prior: _Prior, codes: ViewCode) -> _Prior:
+def encoded(prior: Prior, codes: ViewCode) -> Prior:
     """The prior, for images that have been encoded before: neither contender is charged for them."""
     ready = copy.copy(prior)
     ready.encode = lambda images: codes  # type: ignore[method-assign]
@@ -151,6 +147,7 @@ def looped(loops: Sequence[PlainLoop], steps: int) -> None:
 
 def measure_step(section: Section, computing: Computing, starts: Sequence[int], rounds: int, steps: int) -> None:
     """Optimisation steps on random weights; `computing` is how the batch is computed, the loop is as published."""
+    section.title, section.contenders = "second stage: a step of one pair", CONTENDERS
     device = section.device
     networks, pair = computing.networks(device), random_pair(device)
     batch_prior, loop_prior = computing.prior(networks), plain_prior(networks)
@@ -190,6 +187,7 @@ def measure_pair(
     The first computes as `computing` says and encodes the images of each pair. The first pair of a number of starts, in
     which kernels are chosen, compiled or recorded, is told apart. `paper_seconds` are the paper's by number of starts.
     """
+    section.title, section.contenders = "pair: both stages and encoding", CONTENDERS
     networks, pair = computing.networks(section.device), random_pair(section.device)
     batch_prior, loop_prior = computing.prior(networks), plain_prior(networks)
     solver = TwoStage(model, batch_prior, refinement_steps=steps)
@@ -235,6 +233,7 @@ def measure_precision(
     max_batch: int | None,
 ) -> None:  # fmt: skip
     """Steps of a pair on the same random weights, a variant after the other, so that two U-Nets are held at most."""
+    section.title, section.contenders = "precision: a step of one pair", ("as named", "plain float32")
     device, plain = section.device, Computing(architecture, max_batch=max_batch)
     computings = {words: variant(words, architecture, max_batch) for words in variants}
     networks, pair = plain.networks(device), random_pair(device)

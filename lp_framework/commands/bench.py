@@ -25,16 +25,15 @@ from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.report.paper import paper_table
 
 RESULT = "bench.json"
-# Each with the title and the contenders of its section.
-MEASUREMENTS: dict[str, tuple[Callable[..., None], tuple[str, tuple[str, str]]]] = {
-    "loader": (batches.measure_loading, batches.LOADING),
-    "encoding": (batches.measure_encoding, batches.ENCODING),
-    "first_stage": (stages.measure_first_stage, stages.FIRST_STAGE),
-    "second_stage": (zero123.measure_step, zero123.STEP),
-    "pair": (zero123.measure_pair, zero123.PAIR),
-    "precision": (zero123.measure_precision, zero123.PRECISION),
-    "adam_gauss_newton": (stages.measure_descent, stages.DESCENT),
-    "rendering": (rendering.measure, rendering.CONTENDERS),
+MEASUREMENTS: dict[str, Callable[..., None]] = {
+    "loader": batches.measure_loading,
+    "encoding": batches.measure_encoding,
+    "first_stage": stages.measure_first_stage,
+    "second_stage": zero123.measure_step,
+    "pair": zero123.measure_pair,
+    "precision": zero123.measure_precision,
+    "adam_gauss_newton": stages.measure_descent,
+    "rendering": rendering.measure,
 }
 
 
@@ -55,11 +54,10 @@ def run(config: DictConfig) -> None:
     sections: dict[str, Section] = {}
     try:
         for name in names:
-            function, (title, contenders) = MEASUREMENTS[name]
-            wanted = arguments(name, function, settings, device)
-            sections[name] = Section(title, contenders, device)
+            wanted = arguments(name, settings, device)
+            sections[name] = Section(device)
             with Console(stderr=True).status(f"measuring {name}"):
-                function(sections[name], **wanted)
+                MEASUREMENTS[name](sections[name], **wanted)
             del wanted
             gc.collect()
             torch.cuda.empty_cache()
@@ -69,9 +67,7 @@ def run(config: DictConfig) -> None:
             show(sections, folder / RESULT)
 
 
-def arguments(
-    name: str, function: Callable[..., None], settings: Mapping[str, Any], device: torch.device
-) -> dict[str, Any]:
+def arguments(name: str, settings: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
     """What a measurement takes besides its section: the settings of its name, and objects by theirs."""
     components = Components(settings)  # anew, so that no measurement finds the GPU full of another's networks
     makers: dict[str, Callable[[], object]] = {
@@ -84,9 +80,9 @@ def arguments(
         "renderer": lambda: components["renderer"],
         "paper_seconds": paper_seconds,
     }
-    wanted = inspect.signature(function).parameters
+    wanted = inspect.signature(MEASUREMENTS[name]).parameters
     objects = {key: make() for key, make in makers.items() if key in wanted}
-    return {**_settings(settings, name, function), **objects}
+    return {**_settings(settings, name, MEASUREMENTS[name]), **objects}
 
 
 def _settings(settings: Mapping[str, Any], section: str, taker: Callable[..., Any]) -> dict[str, Any]:
