@@ -43,7 +43,6 @@ OF_NO_USE = (
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
     r"The number of training batches .* is smaller than the logging interval",
     r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk
-    r"Experiment logs directory .* exists and is not empty",  # it is the run's folder
     r"Checkpoint directory .* exists and is not empty",
     r"Total length of `DataLoader` across ranks is zero",  # an evaluation of which only the tables were missing
 )

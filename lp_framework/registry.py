@@ -67,7 +67,8 @@ def register(group: str, name: str) -> Callable[[_Class], _Class]:
 
     Raises `UserError` for an unknown group, and for a name that another class of the group already has.
     """
-    _check_group(group)
+    if group not in GROUPS:
+        raise UserError(f"there is no group '{group}'{among(group, GROUPS)}")
 
     def record(cls: _Class) -> _Class:
         built_in = cls.__module__.partition(".")[0] == PACKAGE
@@ -98,7 +99,6 @@ def names(group: str) -> list[str]:
     >>> "score" in names("model")
     True
     """
-    _check_group(group)
     discover()
     for package in GROUPS[group]:
         importlib.import_module(package)
@@ -273,8 +273,3 @@ def _guarded(origin: str) -> Iterator[None]:
         _state.failures[origin] = f"{type(error).__name__}: {error}"
     finally:
         _state.loading = None
-
-
-def _check_group(group: str) -> None:
-    if group not in GROUPS:
-        raise UserError(f"there is no group '{group}'{among(group, GROUPS)}")

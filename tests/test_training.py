@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from tiny_runs import Commands, Ran
 
 from lp_framework.commands.train import MetricsLogger
@@ -304,23 +303,21 @@ def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_o
 
 
 def test_metrics_are_whole_where_the_disk_fills_up(tmp_path, monkeypatch):
-    logger, save = MetricsLogger(tmp_path, name="", version=""), ExperimentWriter.save
+    logger, write = MetricsLogger(tmp_path), Path.write_text
     logger.log_metrics({"train/loss": 1.0}, step=0)
     logger.save()
-    logger.log_metrics({"train/loss": 0.5, "val/loss": 0.7}, step=1)  # a new column, for which Lightning begins anew
 
-    def half(writer: ExperimentWriter) -> None:
-        Path(writer.metrics_file_path).write_text("train/lo")
+    def half(path: Path, text: str, **_: Any) -> None:
+        write(path, text[: len(text) // 2])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch, pytest.raises(UserError, match=r"metrics\.csv: cannot be written \(No space"):
-        patch.setattr(ExperimentWriter, "save", half)
-        logger.save()
+        patch.setattr(Path, "write_text", half)
+        logger.log_metrics({"train/loss": 0.5, "val/loss": 0.7}, step=99)
     assert [row["train/loss"] for row in rows(tmp_path)] == ["1.0"]
     logger.finalize("failed")
-    assert ExperimentWriter.save is save
     assert [(row["step"], row["train/loss"], row["val/loss"]) for row in rows(tmp_path)] == [
-        ("0", "1.0", ""), ("1", "0.5", "0.7"),
+        ("0", "1.0", ""), ("99", "0.5", "0.7"),
     ]  # fmt: skip
     assert [each.name for each in tmp_path.iterdir()] == ["metrics.csv"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import shlex
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning import Trainer
 from lightning.pytorch import callbacks
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from lp_framework import catalogue, registry
-from lp_framework.atomic import written
 from lp_framework.commands import building
 from lp_framework.data.module import PairDataModule
 from lp_framework.errors import UserError
@@ -31,7 +29,7 @@ from lp_framework.report.page import PAGE, write_run_page
 from lp_framework.report.runs import saved_config
 from lp_framework.viz.curves import save_training_picture
 
-METRICS = "metrics.csv"  # Lightning's name
+METRICS = "metrics.csv"
 OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, without use in eval
 
 
@@ -52,10 +50,8 @@ def run(config: DictConfig) -> None:
         )
     settings = building.plain(config)
     _check(settings)
-    steps = 0
+    checkpoint, epochs = read_checkpoint(last) if begun else {}, settings["trainer"]["max_epochs"]
     if begun:
-        checkpoint, epochs = read_checkpoint(last), settings["trainer"]["max_epochs"]
-        steps = checkpoint["global_step"]
         reported = all((folder / name).is_file() for name in (building.TRAINING, PAGE))
         if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and reported:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -71,15 +67,12 @@ def run(config: DictConfig) -> None:
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
     data.carry(*model.carries)
-    metrics = MetricsLogger(folder, name="", version="")
-    boards = [TensorBoardLogger(folder, name="tensorboard", version="")] if settings["logger"]["tensorboard"] else []
-    trainer = building.build_trainer(
-        settings["trainer"], folder, chosen_callbacks(settings, folder), logger=[metrics, *boards]
-    )
+    loggers: list[Logger] = [MetricsLogger(folder, checkpoint.get("global_step", 0))]
+    if settings["logger"]["tensorboard"]:
+        loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))
+    trainer = building.build_trainer(settings["trainer"], folder, chosen_callbacks(settings, folder), loggers)
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
-        if begun:
-            keep_metrics(metrics, steps)
     with building.resumable(folder, FOLDER):
         trainer.fit(model, datamodule=data, ckpt_path=last if begun else None, weights_only=True)
         if trainer.is_global_zero:
@@ -128,33 +121,36 @@ def next_command(settings: Mapping[str, Any], folder: str) -> str:
     return " ".join(["python -m lp_framework eval", f"checkpoint={folder}", *chosen, *changed])
 
 
-class MetricsLogger(CSVLogger):
-    """Lightning's, whose file, `METRICS` in the run's folder, is whole at any moment."""
+class MetricsLogger(Logger):
+    """`METRICS` in a run's folder, whole at any moment; of a run that goes on it keeps the rows up to its checkpoint's
+    step."""
+
+    name = version = ""
+
+    def __init__(self, folder: Path, steps: int = 0) -> None:
+        super().__init__()
+        self.file = folder / METRICS
+        self.rows: list[dict[str, Any]] = []
+        if self.file.is_file():
+            with self.file.open(newline="") as content:
+                self.rows += [row for row in csv.DictReader(content) if row["step"] and int(row["step"]) < steps]
+
+    def log_hyperparams(self, *_: Any, **__: Any) -> None:
+        """They are in `config.yaml`."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """Add a row, which the file gets within a hundred steps."""
+        self.rows.append({**metrics, "step": step})
+        if step is not None and (step + 1) % 100 == 0:
+            self.save()
 
     @rank_zero_only
     def save(self) -> None:
-        """Write the file with the rows that came since as another, which takes its place."""
-        file, writer = Path(self.log_dir) / METRICS, self.experiment
-        if not writer.metrics:
-            return
-        with written(file) as partial:
-            if file.is_file():
-                shutil.copyfile(file, partial)
-            writer.metrics_file_path = str(partial)
-            super().save()
-
-
-def keep_metrics(logger: MetricsLogger, steps: int) -> None:
-    """Keep the rows of a run that goes on, up to its checkpoint's step: Lightning would begin the file anew."""
-    file = Path(logger.log_dir) / METRICS
-    if not file.is_file():
-        return
-    with file.open(newline="") as content:
-        reader = csv.DictReader(content)
-        rows = [list(row.values()) for row in reader if row["step"] and int(row["step"]) < steps]
-    with written(file) as partial:
-        write_csv(partial, columns := list(reader.fieldnames or ()), rows)
-        logger.experiment.metrics_keys = columns  # it removes `file` when it is made
+        """Write the file anew."""
+        columns = sorted({column for row in self.rows for column in row})
+        if self.rows:
+            write_csv(self.file, columns, [[row.get(column, "") for column in columns] for row in self.rows])
 
 
 def report(trainer: Trainer, folder: Path, settings: Mapping[str, Any], data: PairDataModule) -> None:
