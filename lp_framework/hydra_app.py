@@ -273,9 +273,10 @@ def explain(error: Exception) -> str:
     """What to tell a user of an error that Hydra or OmegaConf raised."""
     cause = error.__cause__ or error.__context__
     match error:
-        case MissingConfigException(missing_cfg_file=str(file), options=options) if options is not None:
+        case MissingConfigException(missing_cfg_file=str(file)) if "/" in file:
             group, _, choice = file.rpartition("/")
-            told = f"{group}={choice}: there is no {group} '{choice}'{among(choice, options)}"
+            known = error.options or catalogue.choices(group)  # Hydra has none of what a file asks for
+            told = f"{group}={choice}: there is no {group} '{choice}'{among(choice, known)}"
             if group == "hydra/launcher":
                 return f"{told}; pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]' brings some"
             return told + ("; some plugins could not be loaded, see above" if registry.failures() else "")
