@@ -153,7 +153,8 @@ def _check_paths(config: DictConfig) -> None:
         how = f"to train it: lp train hydra.run.dir={checkpoint}"
         raise UserError(f"checkpoint={checkpoint}: there is no such file or folder; {how}")
     path = OmegaConf.select(config, "data.path")
-    if path is not None and not Path(path).exists():
+    photographs = config.get("image") or config.get("images")  # instead of the data
+    if not photographs and path is not None and not Path(path).exists():
         (line, *_) = catalogue.read(f"data/{config.data.name}").settings.get("path", [""])
         if registry.MISSING in line:  # other folders are made
             raise UserError(f"data.path={path}: there is no such file or folder")

@@ -151,7 +151,7 @@ def test_the_overview_has_an_ambiguity_for_every_object(commands):
         (["object=tram", "query=last"], "query must be the number of a test view, got last"),
         (["object=tram", "images=[views,plugins]"], "give object=NAME for views of the data set or images="),
         (["images=[views,views,views]"], "images: a landscape is of two files, got 3"),
-        (["images=[a.png,b.png]"], "a.png: there is no such file"),
+        (["images=[a.png,b.png]"], "images=a.png: there is no such file or folder"),
         (["query=3"], "query is of the landscape of a pair; give object=NAME or images=[A.png,B.png], too"),
         (["solver.steps=3"], "solver.steps is of the landscape of a pair; give object=NAME"),
         (["object=tram", "query=1", "longitude_step_degrees=50"], "longitude_step_degrees must divide 360"),
