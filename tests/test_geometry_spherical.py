@@ -15,6 +15,8 @@ from torch import Tensor
 from lp_framework.geometry import (
     apply_relative_pose,
     camera_to_world,
+    is_rotation,
+    level_camera,
     reduce_longitude,
     relative_pose,
     rigid_transform,
@@ -206,6 +208,35 @@ def test_a_rolled_camera_has_its_roll_as_residual(degrees: float) -> None:
     roll = rigid_transform(so3_exp(double([0.0, 0.0, math.radians(degrees)])), torch.zeros(3, dtype=torch.float64))
     assert spherical_residual(camera).max() < 1e-12
     torch.testing.assert_close(spherical_residual(camera @ roll), double([degrees] * 5), rtol=1e-6, atol=1e-11)
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_level_camera_sees_the_origin_along_the_direction_and_is_level(batch: tuple[int, ...]) -> None:
+    pose = random_poses(batch) * double(
+        [0.7, 1.0, 1.0]
+    )  # latitudes up to 63 degrees, directions up to 23 from the axis
+    direction = torch.cat(
+        [double([0.3, -0.2]) * random_poses(batch, seed=1)[..., :2].sin(), -double([1.0]).expand(*batch, 1)], -1
+    )
+    camera = level_camera(pose, direction)
+    rotation, centre = camera[..., :3, :3], camera[..., :3, 3]
+    assert is_rotation(rotation, 1e-12).all() and (rotation[..., 1, 1] > 0).all()
+    torch.testing.assert_close(centre, camera_to_world(pose)[..., :3, 3])
+    assert rotation[..., 1, 0].abs().max() < 1e-12
+    seen = -(rotation.mT @ centre[..., None])[..., 0]
+    torch.testing.assert_close(torch.linalg.cross(seen, direction), torch.zeros_like(seen), rtol=0, atol=1e-12)
+    assert ((seen * direction).sum(-1) > 0).all()
+    ahead = level_camera(pose, 3 * double([0.0, 0.0, -1.0]).expand(*batch, 3))
+    torch.testing.assert_close(ahead, camera_to_world(pose))
+
+
+def test_level_camera_above_the_object_sees_it_along_the_direction_too() -> None:
+    """There none is level that sees the origin at its side."""
+    direction = double([0.2, 0.1, -1.0])
+    for latitude in (math.pi / 2, -1.5, math.pi / 2 - 1e-9):
+        camera = level_camera(double([latitude, 1.0, 2.0]), direction)
+        seen = -(camera[:3, :3].mT @ camera[:3, 3])
+        torch.testing.assert_close(seen, 2 * direction / direction.norm())
 
 
 def test_cameras_are_differentiable_and_smooth_at_the_poles() -> None:

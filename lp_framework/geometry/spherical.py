@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor
 
-from lp_framework.geometry.se3 import geodesic_angle, rigid_transform
+from lp_framework.geometry.se3 import geodesic_angle, rigid_transform, so3_exp
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -77,6 +77,29 @@ def camera_to_world(pose: Tensor) -> Tensor:
     up = torch.stack([-sin_lat * sin_lon, cos_lat, -sin_lat * cos_lon], dim=-1)
     backward = torch.stack([cos_lat * sin_lon, sin_lat, cos_lat * cos_lon], dim=-1)
     return rigid_transform(torch.stack([right, up, backward], dim=-1), radius[..., None] * backward)
+
+
+def level_camera(pose: Tensor, direction: Tensor) -> Tensor:
+    """Camera `[..., 4, 4]` at a view pose `[..., 3]`, held level (its +X axis is horizontal), that sees the origin
+    along `direction` `[..., 3]`, a vector of any length in the camera's own axes with a negative third entry.
+
+    It is `camera_to_world(pose)`, which sees the origin straight ahead, turned until the origin appears along
+    `direction`. Near a pole there may be no level camera; the result then has the least roll.
+
+    >>> camera = level_camera(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, -1.0]))  # the origin at the right
+    >>> camera[:, 2]  # so it looks to the left of it
+    tensor([0.7071, 0.0000, 0.7071, 0.0000])
+    """
+    x, y, z = direction.unbind(-1)
+    aside = torch.hypot(x, y)
+    axis = torch.stack([-y, x, torch.zeros_like(x)], dim=-1) / aside.clamp(min=torch.finfo(x.dtype).tiny)[..., None]
+    turn = so3_exp(axis * torch.atan2(aside, -z)[..., None])  # the smallest that takes `direction` to straight ahead
+    right, up, back = turn[..., 0].unbind(-1)  # where it takes the +X axis, which is horizontal after this roll:
+    sine = -pose[..., 0].tan() * back / torch.hypot(right, up)
+    roll = torch.asin(sine.clamp(-1, 1)) - torch.atan2(up, right)
+    ahead = camera_to_world(pose)
+    rotation = ahead[..., :3, :3] @ so3_exp(torch.stack([0 * roll, 0 * roll, roll], dim=-1)) @ turn
+    return rigid_transform(rotation, ahead[..., :3, 3])
 
 
 def view_pose(camera: Tensor) -> Tensor:
