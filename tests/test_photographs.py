@@ -18,15 +18,14 @@ from PIL import Image, features
 
 from lp_framework.data.cache import decoded_views
 from lp_framework.data.masks import mask_maker
+from lp_framework.data.photograph_files import mask_beside, mask_files, photograph_files
 from lp_framework.data.photographs import (
     EXTENT,
     SIZE,
     array_image,
     crop_to_object,
     cut_out,
-    mask_files,
     on_white,
-    photograph_files,
     prepare,
     read_image,
     read_mask,
@@ -405,6 +404,13 @@ def test_photographs_are_those_of_a_folder_by_name_or_of_a_list_as_given(tmp_pat
     assert photograph_files(["z.png", "a.png"]) == [Path("z.png"), Path("a.png")]
 
 
+def test_photographs_are_sorted_as_people_count(tmp_path: Path):
+    names = ["1.png", "2.png", "10.png", "IMG_09.png", "IMG_9.png", "IMG_10.png", "IMG_10 (2).png", "IMG_10 (10).png"]
+    for name in sorted(names):
+        Image.fromarray(drawn()).save(tmp_path / name)
+    assert [file.name for file in photograph_files(tmp_path)] == names
+
+
 def test_photographs_of_telephones_and_browsers_are_read_or_named(tmp_path: Path):
     image = Image.fromarray(drawn()[..., :3])
     for name, kind in (("a.jfif", "jpeg"), ("b.JPE", "jpeg"), ("c.gif", "gif")):
@@ -433,7 +439,7 @@ def test_too_few_photographs(tmp_path: Path):
             photograph_files(images)
 
 
-@pytest.mark.parametrize("names", [("a_mask.png", "b_mask.png"), ("a.png.png", "b.png.png"), ()])
+@pytest.mark.parametrize("names", [("a-mask.png", "b-mask.png"), ("mask_a.png", "mask_b.png"), ()])
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
 def test_masks_of_other_names_are_told_and_not_passed_over(names: tuple[str, ...], mode: str, tmp_path: Path):
     """Whether or not the photographs have alpha channels, which would do."""
@@ -463,6 +469,49 @@ def test_a_photograph_that_lacks_a_mask_others_have_is_named(rembg, tmp_path: Pa
         read_photographs([a, c], tmp_path / "masks", remove_background=False, crop=True)
     with pytest.warns(UserWarning, match="c.png: has no mask; .*; its whole picture is taken"):
         read_photographs([a, c], tmp_path / "masks", remove_background=False, crop=False)
+
+
+@pytest.mark.parametrize("name", ["{stem}_mask.png", "{stem}.mask.PNG", "{stem}.jpg.png", "dynamic_mask_{stem}.png"])
+@pytest.mark.parametrize("place", ["", "masks"])
+def test_masks_are_found_where_other_programs_put_them(name: str, place: str, tmp_path: Path):
+    """And are not taken for photographs. Instant-ngp's mark what is *not* to be seen."""
+    (tmp_path / "images" / place).mkdir(parents=True)
+    cut = placed(drawn(), 20, 30)
+    expected = prepare(cut.convert("RGB"), "a", cut.getchannel("A").point([0] * 128 + [255] * 128))
+    for stem in ("2", "10"):
+        saved(cut.convert("RGB"), tmp_path / "images" / f"{stem}.jpg", quality=100, subsampling=0)
+        mask = cut.getchannel("A").point([0] * 128 + [255] * 128)
+        if name.startswith("dynamic"):
+            mask = mask.point(lambda level: 255 - level)
+        saved(mask, tmp_path / "images" / place / name.format(stem=stem))
+    files = photograph_files(tmp_path / "images")
+    assert [file.name for file in files] == ["2.jpg", "10.jpg"]
+    if not place:
+        assert photograph_files(sorted((tmp_path / "images").iterdir())) == files[::-1]
+    for masks in (None, tmp_path / "images" / place):
+        for photograph in read_photographs(files, masks, remove_background=False, crop=True):
+            prepared = photograph.prepared(True)
+            assert np.array_equal(prepared.getchannel("A"), expected.getchannel("A"))
+
+
+def test_masks_of_nerfstudio_are_found_beside_the_images(tmp_path: Path, caplog):
+    """In `masks/NAME.png` beside `images/`; an alpha channel comes before what is found there."""
+    caplog.set_level("INFO")
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    cut = placed(drawn(), 20, 30)
+    plain = saved(cut.convert("RGB"), tmp_path / "images" / "frame_1.jpg")
+    transparent = saved(cut, tmp_path / "images" / "frame_2.png")
+    masks = [saved(cut.getchannel("A"), tmp_path / "masks" / f"frame_{index}.png") for index in (1, 2)]
+    assert mask_beside(plain) == masks[0]
+    read = read_photographs([plain, transparent], None, remove_background=False, crop=True)
+    assert [each.mask is None for each in read] == [False, True]
+    assert "masks that lie beside the photographs are taken: frame_1.png" in caplog.messages
+    saved(cut.getchannel("A"), tmp_path / "images" / "frame_1_mask.png")
+    saved(cut.getchannel("A"), tmp_path / "images" / "frame_1.mask.png")
+    with pytest.raises(UserError, match=r"frame_1\.mask\.png and .*frame_1_mask\.png are both masks of .*frame_1\.jpg"):
+        mask_beside(plain)
+    assert mask_beside(Path("elsewhere") / "a.jpg") is None
 
 
 def test_masks_are_found_by_name(tmp_path: Path):

@@ -21,7 +21,8 @@ from lp_framework.analysis.confidence import Answer, answers, answers_by_prior
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
 from lp_framework.data.masks import mask_maker
-from lp_framework.data.photographs import SIZE, photograph_files, read_photographs, save_png
+from lp_framework.data.photograph_files import photograph_files
+from lp_framework.data.photographs import SIZE, read_photographs, save_png
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, colmap_model, nerf_transforms
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_csv, write_json, write_text

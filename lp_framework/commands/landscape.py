@@ -24,7 +24,8 @@ from lp_framework.analysis.landscapes import landscape_grid
 from lp_framework.analysis.pairs import PoseMap, ShownPair, View, explained_pair, named_pairs, words
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, plain, warn_of_photographs
-from lp_framework.data.photographs import on_white, photograph_files, prepared_photographs
+from lp_framework.data.photograph_files import photograph_files
+from lp_framework.data.photographs import on_white, prepared_photographs
 from lp_framework.errors import UserError
 from lp_framework.evaluation.tables import write_arrays, write_json
 from lp_framework.models.pose_model import FieldValue

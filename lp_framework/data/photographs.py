@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 import math
-import mimetypes
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +28,7 @@ from lp_framework.atomic import written
 from lp_framework.data.files import expecting
 from lp_framework.data.images import eight_bit
 from lp_framework.data.masks import HALF, alpha_opacity, mask_maker, mask_opacity, without_strays
+from lp_framework.data.photograph_files import DYNAMIC, listed, mask_beside, mask_files, no_mask
 from lp_framework.errors import UserError
 
 log = logging.getLogger(__name__)
@@ -36,77 +36,7 @@ log = logging.getLogger(__name__)
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
 SMALLEST = 16  # pixels; a smaller object in a photograph says too little
 CUT_OFF = 0.1  # of the object's longest side: along the border, so much of it is no touch but a cut
-SUFFIXES = (
-    ".bmp", ".gif", ".jfif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp",
-    ".avif",
-)  # fmt: skip
 EMPTY = "its mask is empty, nothing in it is at least half opaque"
-SHOWN = 5  # names of files in a sentence
-
-
-def photograph_files(images: str | Path | Sequence[str | Path] | None) -> list[Path]:
-    """The image files of a folder, sorted by name, or those of a list, as given; at least two, or a `UserError`. Warns
-    of files in the folder that are not read and may be photographs."""
-    if images is None:
-        raise UserError("images needs a value: a folder, or a list of files, images=[A.png,B.png]")
-    if isinstance(images, str | Path):
-        folder = Path(images)
-        if not folder.is_dir():
-            what = "is one image, two or more are needed" if folder.exists() else "there is no such folder"
-            raise UserError(f"images={folder}: {what}; give a list, images=[A.png,B.png], or a folder")
-        files = _images_in(folder)
-        if left_out := [file.name for file in sorted(folder.iterdir()) if file not in files and _may_show(file)]:
-            hint = "save photographs as PNG or JPEG"
-            warnings.warn(f"images={folder}: files that are not read: {_listed(left_out)}; {hint}", stacklevel=2)
-    else:
-        files = [Path(str(image)) for image in images]
-    if len(files) < 2:
-        known = ", ".join(SUFFIXES)
-        raise UserError(f"images={images}: two or more are needed, got {len(files)}; give a list or a folder ({known})")
-    return files
-
-
-def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
-    """For every image its mask, the image of the same name in `folder` (with any suffix); None where there is none.
-    `UserError` where no image has one."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise UserError(f"masks={folder}: there is no such folder")
-    first: dict[str, Path] = {}
-    for file in files:
-        if first.setdefault(file.stem, file) != file:
-            both = f"{first[file.stem]} and {file}"
-            raise UserError(f"{both} have the same name, so {folder} cannot tell their masks apart")
-    masks: dict[str, Path] = {}
-    for mask in _images_in(folder):
-        if masks.setdefault(mask.stem, mask) != mask and mask.stem in first:
-            raise UserError(f"{masks[mask.stem]} and {mask} are both masks of {first[mask.stem]}")
-    found = [masks.get(file.stem) for file in files]
-    if not any(found):
-        raise UserError(_no_mask(files[0], folder))
-    return found
-
-
-def _no_mask(file: Path, folder: str | Path) -> str:
-    """What was looked for and found where an image has no mask in `folder`."""
-    names = [found.name for found in sorted(Path(folder).iterdir()) if found.name[0] != "."]
-    there = _listed(names) or "nothing"
-    return f"{file}: has no mask; looked for {Path(folder) / file.stem}.png (or with another suffix), found {there}"
-
-
-def _images_in(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != ".")
-
-
-def _may_show(file: Path) -> bool:
-    """Whether a file that is not read may be a photograph: it is not known as text or as anything else."""
-    kind = mimetypes.guess_type(file.name)[0] or "unknown"
-    return file.is_file() and file.name[0] != "." and kind.partition("/")[0] in ("unknown", "image", "video")
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
 
 
 @contextmanager
@@ -120,9 +50,12 @@ def opened(file: str | Path) -> Iterator[Image.Image]:
 
 def read_mask(file: str | Path) -> Image.Image:
     """A mask file, turned as its EXIF orientation says: RGB or RGBA, or the numbers that it holds (see
-    `masks.mask_opacity`); `UserError` naming the file where it cannot be read."""
+    `masks.mask_opacity`), and the opposite of one of instant-ngp's; `UserError` naming the file where it cannot be
+    read."""
     with opened(file) as opened_mask:
         mask = ImageOps.exif_transpose(opened_mask)
+        if Path(file).name.startswith(DYNAMIC):
+            return Image.fromarray(~np.asarray(mask.convert("RGB")).any(axis=2))
         if mask.mode[0] not in "IF":
             return mask.convert("RGBA" if mask.has_transparency_data else "RGB")
         mask.load()
@@ -257,22 +190,27 @@ class Photograph(NamedTuple):
 def read_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
 ) -> list[Photograph]:
-    """Image files with their masks from the folder `masks`, or, with `remove_background`, made for those that have
-    neither mask nor alpha channel; all images are read before that begins."""
+    """Image files with their masks: those in the folder `masks`; without it, of images without alpha channel, those of
+    `mask_beside`; and, with `remove_background`, masks that are made for images that have neither. All images are read
+    before that begins."""
     for name, value in (("remove_background", remove_background), ("crop", crop)):
         if not isinstance(value, bool):
             raise UserError(f"{name} must be true or false, got {value}")
     found = mask_files(files, masks) if masks is not None else [None] * len(files)
     images = [read_image(file) for file in files]
+    marks = [image.mode == "RGBA" and alpha_opacity(image.getchannel("A")) is not None for image in images]
+    if masks is None:
+        found = [None if marked else mask_beside(file) for file, marked in zip(files, marks, strict=True)]
+        if beside := [mask.name for mask in found if mask is not None]:
+            log.info("masks that lie beside the photographs are taken: %s", listed(beside))
     given = [None if mask is None else read_mask(mask) for mask in found]
     read = []
-    for file, image, mask in zip(files, images, given, strict=True):
-        marked = image.mode == "RGBA" and alpha_opacity(image.getchannel("A")) is not None
+    for file, image, mask, marked in zip(files, images, given, marks, strict=True):
         if masks is not None and mask is None:
             if crop and not marked and not remove_background:
-                raise UserError(_no_mask(file, masks))
+                raise UserError(no_mask(file, masks))
             instead = "alpha channel" if marked else "made mask" if remove_background else "whole picture"
-            warnings.warn(f"{_no_mask(file, masks)}; its {instead} is taken", stacklevel=2)
+            warnings.warn(f"{no_mask(file, masks)}; its {instead} is taken", stacklevel=2)
         made = remove_background and mask is None and not marked
         read.append(Photograph(str(file), image, made_mask(image, str(file)) if made else mask, made))
     return read

@@ -1,0 +1,115 @@
+"""Which files are photographs of the object, and which are their masks."""
+
+from __future__ import annotations
+
+import mimetypes
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from lp_framework.errors import UserError
+
+SUFFIXES = (
+    ".bmp", ".gif", ".jfif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp",
+    ".avif",
+)  # fmt: skip
+SHOWN = 5  # names of files in a sentence
+DYNAMIC = "dynamic_mask_"  # begins the names of instant-ngp's masks, in which the background is *not* black
+
+
+def photograph_files(images: str | Path | Sequence[str | Path] | None) -> list[Path]:
+    """The image files of a folder, sorted by name (2 before 10), or those of a list, as given, without those that are
+    masks of others; at least two, or a `UserError`. Warns of files in the folder that are not read and may be
+    photographs."""
+    if images is None:
+        raise UserError("images needs a value: a folder, or a list of files, images=[A.png,B.png]")
+    if isinstance(images, str | Path):
+        folder = Path(images)
+        if not folder.is_dir():
+            what = "is one image, two or more are needed" if folder.exists() else "there is no such folder"
+            raise UserError(f"images={folder}: {what}; give a list, images=[A.png,B.png], or a folder")
+        found = _images_in(folder)
+        if left_out := [file.name for file in sorted(folder.iterdir()) if file not in found and _may_show(file)]:
+            hint = "save photographs as PNG or JPEG"
+            warnings.warn(f"images={folder}: files that are not read: {listed(left_out)}; {hint}", stacklevel=2)
+    else:
+        found = [Path(str(image)) for image in images]
+    masks = {(file.parent, stem) for file in found for stem in _mask_stems(file)[1:]}
+    files = [file for file in found if (file.parent, file.stem) not in masks]
+    if len(files) < 2:
+        known = ", ".join(SUFFIXES)
+        raise UserError(f"images={images}: two or more are needed, got {len(files)}; give a list or a folder ({known})")
+    return files
+
+
+def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
+    """For every image its mask in `folder`; None where there is none. The mask of `front.jpg` is called `front.png` (as
+    in nerfstudio), `front.jpg.png` (COLMAP), `front_mask.png`, `front.mask.png` or `dynamic_mask_front.png`
+    (instant-ngp), or so with another suffix. `UserError` where no image has one, and where an image has two."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"masks={folder}: there is no such folder")
+    first: dict[str, Path] = {}
+    for file in files:
+        if first.setdefault(file.stem, file) != file:
+            both = f"{first[file.stem]} and {file}"
+            raise UserError(f"{both} have the same name, so {folder} cannot tell their masks apart")
+    there = _images_in(folder)
+    found = [_mask_among(there, file, _mask_stems(file)) for file in files]
+    if not any(found):
+        raise UserError(no_mask(files[0], folder))
+    return found
+
+
+def mask_beside(file: Path) -> Path | None:
+    """The mask of an image where other programs put it: beside the image under one of those names, in a folder `masks`
+    there, or, of an image in a folder `images`, in the folder `masks` next to that (nerfstudio)."""
+    folder, stems = file.parent, _mask_stems(file)
+    places = [(folder, stems[1:]), (folder / "masks", stems)]
+    if folder.name == "images":
+        places.append((folder.parent / "masks", stems))
+    masks = (_mask_among(_images_in(place), file, names) for place, names in places if place.is_dir())
+    return next(filter(None, masks), None)
+
+
+def _mask_stems(file: Path) -> list[str]:
+    """What masks of an image are called, without suffix; the first is the image's own name."""
+    others = [f"{file.stem}_mask", f"{file.stem}.mask", f"{DYNAMIC}{file.stem}"]
+    return [file.stem, *others, *([file.name] if file.suffix else [])]
+
+
+def _mask_among(masks: Sequence[Path], file: Path, stems: Sequence[str]) -> Path | None:
+    found = [mask for mask in masks if mask.stem in stems and mask != file]
+    if len(found) > 1:
+        raise UserError(f"{found[0]} and {found[1]} are both masks of {file}")
+    return found[0] if found else None
+
+
+def no_mask(file: Path, folder: str | Path) -> str:
+    """What was looked for and found where an image has no mask in `folder`."""
+    names = [found.name for found in sorted(Path(folder).iterdir()) if found.name[0] != "."]
+    there = listed(names) or "nothing"
+    return f"{file}: has no mask; looked for {Path(folder) / file.stem}.png (or with another suffix), found {there}"
+
+
+def _images_in(folder: Path) -> list[Path]:
+    images = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != "."]
+    return sorted(images, key=_as_counted)
+
+
+def _as_counted(file: Path) -> tuple[list[int | str], str]:
+    """What sorts names as people count: `2.png` before `10.png`."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.stem)], file.name
+
+
+def _may_show(file: Path) -> bool:
+    """Whether a file that is not read may be a photograph: it is not known as text or as anything else."""
+    kind = mimetypes.guess_type(file.name)[0] or "unknown"
+    return file.is_file() and file.name[0] != "." and kind.partition("/")[0] in ("unknown", "image", "video")
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
