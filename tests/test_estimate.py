@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from colmap_reader import read_colmap
 from conftest import Finished
 from drawn_photographs import drawn, placed
@@ -21,6 +22,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 from toy_views import toy_view
+from transforms_readers import as_ifusion, as_instant_ngp, as_nerfstudio
 
 import lp_framework
 from lp_framework import registry
@@ -30,7 +32,7 @@ from lp_framework.commands.estimate import warn_of_prior
 from lp_framework.data.masks import mask_maker
 from lp_framework.data.photographs import on_white, prepare
 from lp_framework.errors import UserError
-from lp_framework.geometry import camera_to_world
+from lp_framework.geometry import camera_to_world, view_pose
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver
 
@@ -117,7 +119,7 @@ def test_a_field_of_view_that_the_solver_was_told_is_that_of_the_exports_and_pic
     assert finished.status == 0, finished.err
     transforms = json.loads((tmp_path / "run" / "transforms.json").read_text())
     assert transforms["camera_angle_x"] == pytest.approx(math.radians(30))
-    cameras = (tmp_path / "run" / "colmap" / "cameras.txt").read_text().splitlines()[1].split()
+    cameras = (tmp_path / "run" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[1].split()
     assert float(cameras[4]) == float(cameras[5]) == pytest.approx(128 / math.tan(math.radians(15)))
     assert drawn_with and drawn_with == pytest.approx([math.radians(30)] * len(drawn_with))
 
@@ -152,7 +154,7 @@ def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
     matrices = torch.tensor([frame["transform_matrix"] for frame in transforms["frames"]], dtype=torch.float64)
     torch.testing.assert_close(matrices, cameras, rtol=0, atol=1e-6)
 
-    _, images = read_colmap({file.name: file.read_text() for file in (run / "colmap").iterdir()})
+    _, images = read_colmap({file.name: file.read_text() for file in (run / "sparse" / "0").iterdir()})
     assert [image.name for image in images] == ["000.png", "001.png", "002.png"]
     for image, camera in zip(images, cameras.numpy(), strict=True):
         np.testing.assert_allclose(-image.rotation.T @ image.translation, camera[:3, 3], atol=1e-6)
@@ -169,6 +171,61 @@ def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
 
     for line in ("front.png", "10.0°", "reference", f"{math.degrees(longitudes[2]):.1f}°", "run/cameras.png"):
         assert line in finished.out
+    scene = trimesh.load(run / "cameras.glb")
+    names = ("0 front.png", "1 left.png", "2 right.png")
+    assert {*scene.graph.nodes_geometry} == {*names, *(f"{name} frustum" for name in names)}
+
+
+def test_cameras_open_elsewhere_with_the_crops_and_with_the_photographs(lp, photos: Path, tmp_path: Path):
+    """One is a JPEG that a telephone has turned, with its focal length; the others do not tell theirs."""
+    exif = Image.Exif()
+    exif[274] = 6  # turn it clockwise
+    exif.get_ifd(0x8769)[41989] = 28  # mm on 35 mm film
+    with Image.open(photos / "left.png") as left:  # 300 x 200, its object at the left above the middle
+        left.convert("RGB").rotate(90, expand=True).save(photos / "left.jpg", exif=exif, quality=95)
+        left.getchannel("A").save(photos / "left_mask.png")
+    (photos / "left.png").unlink()
+    finished = estimate(lp, "images=photos", "radius=1.6")
+    assert finished.status == 0, finished.err
+    run = tmp_path / "run"
+    told = (
+        "no focal length in the EXIF data of front.png, right.png: 1.2 times the longer side is assumed for original/"
+    )
+    assert finished.out.count(told) == 1
+    focals = json.loads((run / "results.json").read_text())["focal_lengths"]
+    film = 28 / math.hypot(36, 24) * math.hypot(300, 200)
+    assert [(each["pixels"], each["known_by"]) for each in focals] == [
+        (360.0, "assumed"), (pytest.approx(film), "EXIF"), (360.0, "assumed"),
+    ]  # fmt: skip
+    crops, photographs = (as_nerfstudio(folder)[0] for folder in (run, run / "original"))
+    assert [crop.file.name for crop in crops] == ["000.png", "001.png", "002.png"]
+    assert [photograph.file.name for photograph in photographs] == ["000.png", "001.jpg", "002.png"]
+    assert (run / "original/images/000.png").read_bytes() == (photos / "front.png").read_bytes()
+    for folder in (run, run / "original"):
+        as_instant_ngp(folder)
+        assert len((folder / "sparse/0/points3D.txt").read_text().splitlines()) > 100
+    for crop, photograph, (focal, _) in zip(crops, photographs, ((each["pixels"], 0) for each in focals), strict=True):
+        assert photograph.size == (300, 200) and photograph.focal == pytest.approx((focal, focal))
+        # Where the object's middle is, 80 to the left of the axis and 50 above, the origin appears.
+        place = np.linalg.inv(photograph.matrix)[:3, 3]
+        seen = [150 - focal * place[0] / place[2], 100 + focal * place[1] / place[2]]
+        assert seen == pytest.approx([70, 50], abs=2)
+        assert view_pose(torch.from_numpy(photograph.matrix))[:2].tolist() == pytest.approx(
+            view_pose(torch.from_numpy(crop.matrix))[:2].tolist(), abs=1e-5
+        )
+    assert len(as_ifusion(run)) == 3
+
+
+def test_whole_views_are_their_photographs(lp, write, tmp_path: Path):
+    write("plugins/tmp_brightness/tmp_brightness.py", SOLVER)
+    for name in ("a", "b"):
+        placed(drawn(200, 160), 20, 30, 512, 512).save(tmp_path / f"{name}.png")
+    finished = estimate(lp, "images=[a.png,b.png]", "crop=false")
+    assert finished.status == 0 and "EXIF" not in finished.out
+    crops, photographs = (as_nerfstudio(folder)[0] for folder in (tmp_path / "run", tmp_path / "run" / "original"))
+    for crop, photograph in zip(crops, photographs, strict=True):
+        np.testing.assert_allclose(photograph.matrix, crop.matrix)
+        assert photograph.size == (512, 512) and photograph.focal[0] == pytest.approx(2 * crop.focal[0])
 
 
 def test_the_first_of_a_list_is_the_reference(lp, photos: Path, tmp_path: Path):
@@ -211,7 +268,8 @@ def test_an_image_without_a_pose_is_left_out_and_named(lp, photos: Path, tmp_pat
     assert [row["valid"] for row in rows(run)] == ["True", "True", "False"]
     transforms = json.loads((run / "transforms.json").read_text())
     assert [frame["file_path"] for frame in transforms["frames"]] == ["images/000.png", "images/001.png"]
-    assert "002.png" not in (run / "colmap/images.txt").read_text()
+    assert "002.png" not in (run / "sparse/0/images.txt").read_text()
+    assert "002.png" not in (run / "original/transforms.json").read_text()
 
 
 def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import types
 import warnings
@@ -25,11 +26,13 @@ from lp_framework.data.photographs import (
     array_image,
     crop_to_object,
     cut_out,
+    exif_focal,
     on_white,
     prepare,
     read_image,
     read_mask,
     read_photographs,
+    save_upright,
     upright,
 )
 from lp_framework.errors import UserError
@@ -52,21 +55,21 @@ def saved(image: Image.Image, file: Path, **options) -> Path:
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 240), st.integers(0, 160))
 def test_where_the_object_stands_makes_no_difference(left: int, top: int):
-    expected = crop_to_object(placed(drawn(), 120, 80), "a")
-    assert np.array_equal(crop_to_object(placed(drawn(), left, top), "a"), expected)
+    expected = crop_to_object(placed(drawn(), 120, 80), "a").image
+    assert np.array_equal(crop_to_object(placed(drawn(), left, top), "a").image, expected)
 
 
 def test_how_large_the_object_is_makes_no_difference_but_for_resampling():
-    expected = on_white(crop_to_object(placed(drawn(), 10, 10), "a")).astype(int)
+    expected = on_white(crop_to_object(placed(drawn(), 10, 10), "a").image).astype(int)
     for scale in (2, 3, 5):
-        larger = on_white(crop_to_object(placed(drawn(scale=scale), 0, 0, 400, 300), "a")).astype(int)
+        larger = on_white(crop_to_object(placed(drawn(scale=scale), 0, 0, 400, 300), "a").image).astype(int)
         difference = np.abs(larger - expected)
         assert difference.mean() < 1.5 and np.median(difference) <= 1
 
 
 @pytest.mark.parametrize(("width", "height"), [(60, 40), (40, 60), (50, 50), (500, 20)])
 def test_the_object_is_centred_and_its_longest_side_fills_the_published_share(width: int, height: int):
-    prepared = crop_to_object(placed(drawn(width, height), 3, 5, 600, 100), "a")
+    prepared = crop_to_object(placed(drawn(width, height), 3, 5, 600, 100), "a").image
     assert prepared.size == (SIZE, SIZE) == (256, 256) and EXTENT == 200
     left, top, right, bottom = object_box(prepared)
     pixel = EXTENT / max(width, height)  # one of the photograph
@@ -81,8 +84,8 @@ def test_hidden_colours_do_not_show_and_the_background_is_white():
     image = drawn()
     hidden = image.copy()
     hidden[hidden[..., 3] == 0, :3] = [0, 255, 0]
-    expected = on_white(crop_to_object(placed(image, 20, 20), "a"))
-    np.testing.assert_array_equal(on_white(crop_to_object(placed(hidden, 20, 20), "a")), expected)
+    expected = on_white(crop_to_object(placed(image, 20, 20), "a").image)
+    np.testing.assert_array_equal(on_white(crop_to_object(placed(hidden, 20, 20), "a").image), expected)
     assert (expected[0] == 255).all() and (expected[:, -1] == 255).all()
 
 
@@ -274,6 +277,46 @@ def test_the_orientation_of_the_camera_is_honoured(orientation: int, suffix: str
     np.testing.assert_allclose(np.asarray(image)[..., 0].astype(int), np.asarray(right).astype(int), atol=6)
     with Image.open(file) as opened:
         assert np.array_equal(upright(opened), image)
+    save_upright(file, tmp_path / f"copy.{suffix}")
+    with Image.open(tmp_path / f"copy.{suffix}") as copy:  # of which others read the pixels alone
+        assert copy.getexif().get(274, 1) == 1
+        np.testing.assert_allclose(np.asarray(copy.convert("RGB")).astype(int), np.asarray(image).astype(int), atol=6)
+
+
+FILM = 50 / math.hypot(36, 24)  # a focal length of 50 mm, in diagonals of the image
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({41989: 50}, FILM * 500),
+        ({41989: 50, 37386: 9.0, 41486: 100.0}, FILM * 500),
+        ({37386: 5.0, 41486: 2540.0}, 500.0),  # mm, and pixels per inch
+        ({37386: 5.0, 41486: 1000.0, 41488: 3}, 500.0),  # per cm
+        ({37386: 5.0, 41486: 2540.0, 40962: 800, 40963: 600}, 250.0),  # of the image before it was made smaller
+        ({41989: 0, 37386: 5.0}, None),
+        ({37386: 5.0, 41486: 0.0}, None),
+        ({41989: "wide"}, None),
+        ({}, None),
+    ],
+)
+def test_the_focal_length_is_that_of_exif(tags: dict[int, float], expected: float | None, tmp_path: Path):
+    exif = Image.Exif()
+    exif[274] = 6
+    exif.get_ifd(0x8769).update(tags)
+    for suffix in ("jpg", "png", "webp"):
+        file = saved(Image.new("RGB", (400, 300)), tmp_path / f"a.{suffix}", exif=exif)
+        focal = exif_focal(read_image(file))
+        assert focal is None if expected is None else focal == pytest.approx(expected)
+
+
+def test_damaged_exif_data_tell_nothing(tmp_path: Path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[41989] = 28
+    file = saved(Image.new("RGB", (400, 300)), tmp_path / "a.jpg", exif=exif)
+    assert exif_focal(read_image(file)) is not None
+    file.write_bytes(file.read_bytes().replace(b"Exif\0\0MM", b"Exif\0\0XX"))
+    assert exif_focal(read_image(file)) is None
 
 
 GREY = np.array([[0, 64], [128, 255]], dtype=np.uint8)
@@ -490,7 +533,7 @@ def test_masks_are_found_where_other_programs_put_them(name: str, place: str, tm
         assert photograph_files(sorted((tmp_path / "images").iterdir())) == files[::-1]
     for masks in (None, tmp_path / "images" / place):
         for photograph in read_photographs(files, masks, remove_background=False, crop=True):
-            prepared = photograph.prepared(True)
+            prepared = photograph.prepared(True).image
             assert np.array_equal(prepared.getchannel("A"), expected.getchannel("A"))
 
 
@@ -597,7 +640,7 @@ def test_without_rembg_or_its_weights_a_rough_mask_is_made_and_said_once(rembg, 
         assert photograph.made and photograph.mask.size == image.size
         mask = np.asarray(photograph.mask) >= 128
         assert (mask & shown).sum() > 0.97 * (mask | shown).sum()
-        assert np.array_equal(photograph.prepared(True), prepare(image, "a", remove_background=True))
+        assert np.array_equal(photograph.prepared(True).image, prepare(image, "a", remove_background=True))
     (said,) = caplog.messages
     assert "GrabCut, since rembg cannot get its weights (no route to host); an alpha channel, masks=FOLDER" in said
 

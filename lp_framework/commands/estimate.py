@@ -20,12 +20,13 @@ from torch import Tensor
 from lp_framework.analysis.confidence import Answer, answers, answers_by_prior
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, warn_of_photographs, warn_of_unused
+from lp_framework.data.camera_files import ASSUMED, ASSUMED_FOCAL, ORIGINAL, export_cameras, original_focal_length
 from lp_framework.data.masks import mask_maker
-from lp_framework.data.photograph_files import photograph_files
-from lp_framework.data.photographs import SIZE, read_photographs, save_png
-from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, colmap_model, nerf_transforms
+from lp_framework.data.photograph_files import listed, photograph_files
+from lp_framework.data.photographs import read_photographs, save_png
+from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.errors import UserError
-from lp_framework.evaluation.tables import write_csv, write_json, write_text
+from lp_framework.evaluation.tables import write_csv, write_json
 from lp_framework.geometry import apply_relative_pose
 from lp_framework.report.page import write_run_page
 from lp_framework.solvers.progress import shown_progress
@@ -44,12 +45,13 @@ RADIUS_LOST = "the crop to the object loses the distance: radius is not estimate
 
 
 def run(config: DictConfig) -> None:
-    """Estimate and write `transforms.json`, `poses.csv`, `colmap/`, `images/`, `cameras.png` and `results.json`."""
+    """Estimate and write `poses.csv`, `results.json`, the cameras with `images/` and `original/`, and `cameras.png`."""
     folder, device, components = begin(config)
     first = _reference_pose(config.latitude_degrees, config.radius)
     files = photograph_files(config.images)
     photographs = read_photographs(files, config.masks, config.remove_background, config.crop)
-    prepared = [each.prepared(config.crop) for each in photographs]
+    framed = [(each, each.prepared(config.crop)) for each in photographs]
+    prepared = [view.image for _, view in framed]
     warn_of_unused(components)
     solver, starts = components["solver"], components["start"]
     move(solver, device)
@@ -68,12 +70,18 @@ def run(config: DictConfig) -> None:
     energies = solution.energies[0].detach().cpu().double()
     if not solution.valid[0]:
         log.warning("the solver did not come to a sound pose for every image")
+    degrees = solver.field_of_view_degrees or FIELD_OF_VIEW_DEGREES
+    focals = [original_focal_length(*each, degrees) for each in framed]
     result = {
         "seconds": solution.cost.seconds,
         "network_passes": solution.cost.network_passes,
         "energies": energies.tolist(),
         "valid": bool(solution.valid[0]),
         "masks_by": mask_maker().name if any(each.made for each in photographs) else None,
+        "focal_lengths": [
+            {"file": str(file), "pixels": focal, "known_by": how}
+            for file, (focal, how) in zip(files, focals, strict=True)
+        ],
         "answers": [_record(file, answer) for file, answer in zip(files[1:], told, strict=bool(told))],
         "checkpoint": str(components.checkpoint) if components.checkpoint else None,
         **components.record(),
@@ -83,9 +91,12 @@ def run(config: DictConfig) -> None:
         if photograph.made and photograph.mask is not None:
             (folder / MASKS).mkdir(exist_ok=True)
             save_png(folder / MASKS / f"{index:03d}.png", photograph.mask)
-    degrees = solver.field_of_view_degrees or FIELD_OF_VIEW_DEGREES
-    rows = _write(folder, files, prepared, torch.cat([absolute, relative], dim=1), energies[0].tolist(), told, degrees)
-    _print(folder, rows, told, radius_lost, result["masks_by"] is not None)
+    poses = torch.cat([absolute, relative], dim=1)
+    rows = _write(folder, files, prepared, poses, energies[0].tolist(), told, degrees)
+    found = [index for index, row in enumerate(rows) if row[-1]]
+    export_cameras(folder, {index: framed[index] for index in found}, absolute[found], degrees)
+    assumed = [file.name for file, (_, how) in zip(files, focals, strict=True) if how == ASSUMED]
+    _print(folder, rows, told, radius_lost, assumed, result["masks_by"] is not None)
     if not told or any(answer.verdict != "trust" for answer in told):
         warn_of_prior(components)
 
@@ -127,8 +138,8 @@ def _write(
     folder: Path, files: Sequence[Path], prepared: Sequence[Image.Image], poses: Tensor, energies: Sequence[float],
     told: Sequence[Answer], degrees: float,
 ) -> list[list[Any]]:  # fmt: skip
-    """The images and their cameras, of absolute and relative poses `[I, 6]` and this field of view; returns the rows of
-    `poses.csv`."""
+    """The images, `poses.csv` and `cameras.png`, of absolute and relative poses `[I, 6]` and this field of view;
+    returns the rows of `poses.csv`."""
     images = [f"images/{index:03d}.png" for index in range(len(files))]
     (folder / "images").mkdir(exist_ok=True)
     for image, picture in zip(images, prepared, strict=True):
@@ -146,15 +157,9 @@ def _write(
     notes = [[""] * 6, *(_notes(answer) for answer in told)] if told else [[""] * 6] * len(rows)
     write_csv(folder / "poses.csv", COLUMNS, [[*row, *note] for row, note in zip(rows, notes, strict=True)])
     found = [index for index, is_pose in enumerate(valid) if is_pose]
-    cameras, names = poses[found, :3], [Path(images[index]).name for index in found]
-    transforms = nerf_transforms([images[index] for index in found], cameras, degrees)
-    write_json(folder / "transforms.json", transforms)
-    (folder / "colmap").mkdir(exist_ok=True)
-    for name, text in colmap_model(names, cameras, SIZE, degrees).items():
-        write_text(folder / "colmap" / name, text)
     pictures, titles = [prepared[index] for index in found], [files[index].name for index in found]
     verdicts = [str(notes[index][2]) for index in found]
-    figure = cameras_figure(cameras.numpy(), pictures, found, titles, degrees, verdicts)
+    figure = cameras_figure(poses[found, :3].numpy(), pictures, found, titles, degrees, verdicts)
     save_figure(figure, folder / "cameras")
     return rows
 
@@ -169,8 +174,9 @@ def _notes(answer: Answer) -> list[Any]:
 
 
 def _print(
-    folder: Path, rows: Sequence[Sequence[Any]], told: Sequence[Answer], radius_lost: bool, masks_made: bool
-) -> None:
+    folder: Path, rows: Sequence[Sequence[Any]], told: Sequence[Answer], radius_lost: bool, assumed: Sequence[str],
+    masks_made: bool,
+) -> None:  # fmt: skip
     """The rows of `poses.csv` for people, and where everything is."""
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -191,9 +197,12 @@ def _print(
             console.print(f"  second: {answer.second_words}", soft_wrap=True)
     if radius_lost:
         console.print(RADIUS_LOST)
-    console.print(f"poses:   {folder}/transforms.json, poses.csv", soft_wrap=True)
-    console.print(f"COLMAP:  {folder}/colmap", soft_wrap=True)
-    console.print(f"images:  {folder}/images", soft_wrap=True)
+    if assumed:
+        factor = f"{ASSUMED_FOCAL:g} times the longer side is assumed for {ORIGINAL}/"
+        console.print(f"no focal length in the EXIF data of {listed(assumed)}: {factor}", soft_wrap=True)
+    console.print(f"poses:   {folder}/poses.csv", soft_wrap=True)
+    console.print(f"cameras: {folder}/transforms.json, sparse/0 (COLMAP), with images; cameras.glb", soft_wrap=True)
+    console.print(f"         {folder}/{ORIGINAL}: the same for the photographs as they were taken", soft_wrap=True)
     if masks_made:
         console.print(f"masks:   {folder}/{MASKS}", soft_wrap=True)
     console.print(f"picture: {folder}/cameras.png", soft_wrap=True)

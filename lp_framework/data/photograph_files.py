@@ -66,9 +66,8 @@ def mask_beside(file: Path) -> Path | None:
     """The mask of an image where other programs put it: beside the image under one of those names, in a folder `masks`
     there, or, of an image in a folder `images`, in the folder `masks` next to that (nerfstudio)."""
     folder, stems = file.parent, _mask_stems(file)
-    places = [(folder, stems[1:]), (folder / "masks", stems)]
-    if folder.name == "images":
-        places.append((folder.parent / "masks", stems))
+    beside = folder.parent / "masks" if folder.name == "images" else folder / "masks"
+    places = (folder, stems[1:]), (folder / "masks", stems), (beside, stems)
     masks = (_mask_among(_images_in(place), file, names) for place, names in places if place.is_dir())
     return next(filter(None, masks), None)
 

@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import logging
 import math
+import numbers
+import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from lp_framework.atomic import written
 from lp_framework.data.files import expecting
@@ -37,6 +39,10 @@ SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object'
 SMALLEST = 16  # pixels; a smaller object in a photograph says too little
 CUT_OFF = 0.1  # of the object's longest side: along the border, so much of it is no touch but a cut
 EMPTY = "its mask is empty, nothing in it is at least half opaque"
+FULL_FRAME = math.hypot(36, 24)  # mm: the diagonal of 35 mm film
+RESOLUTION_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # mm, by EXIF's FocalPlaneResolutionUnit
+
+Box = tuple[int, int, int, int]  # left, top, right, bottom
 
 
 @contextmanager
@@ -73,6 +79,38 @@ def upright(image: Image.Image) -> Image.Image:
     Raises `ValueError` for a mode whose white is not known (floating point)."""
     image = eight_bit(ImageOps.exif_transpose(image))
     return image.convert("RGBA" if image.has_transparency_data else "RGB")
+
+
+def exif_focal(image: Image.Image) -> float | None:
+    """The focal length in pixels that the EXIF data of an image with square pixels tells, None where it tells none: by
+    the equivalent on 35 mm film, whose diagonal is the image's (CIPA DCG-001), or by the pixels of the sensor."""
+    try:
+        exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    except Exception:  # of damaged data, for which Pillow raises anything
+        return None
+
+    def number(tag: ExifTags.Base) -> float:
+        value = exif.get(tag)
+        told = float(value) if isinstance(value, numbers.Real) else 0.0
+        return told if 0 < told < math.inf else 0.0
+
+    if film := number(ExifTags.Base.FocalLengthIn35mmFilm):
+        return film / FULL_FRAME * math.hypot(*image.size)
+    unit = RESOLUTION_UNITS.get(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2), 25.4)
+    pixels = number(ExifTags.Base.FocalLength) * number(ExifTags.Base.FocalPlaneXResolution) / unit
+    recorded = max(number(ExifTags.Base.ExifImageWidth), number(ExifTags.Base.ExifImageHeight))  # before any resizing
+    return pixels * max(image.size) / (recorded or max(image.size)) or None
+
+
+def save_upright(file: Path, copy: Path) -> None:
+    """Copy an image file; one with an EXIF orientation, which most programs do not look at, is turned by it, and loses
+    its EXIF data."""
+    with opened(file) as image, written(copy) as partial:
+        if image.getexif().get(ExifTags.Base.Orientation, 1) == 1:
+            shutil.copyfile(file, partial)
+        else:
+            profile = image.info.get("icc_profile")
+            ImageOps.exif_transpose(image).save(partial, image.format, quality=95, icc_profile=profile)
 
 
 def array_image(array: ArrayLike, name: str) -> Image.Image:
@@ -131,7 +169,14 @@ def made_mask(image: Image.Image, name: str) -> Image.Image:
     return mask
 
 
-def crop_to_object(image: Image.Image, name: str) -> Image.Image:
+class Prepared(NamedTuple):
+    """A prepared image, and the object's bounding box in the one that it was cropped from, None without a crop."""
+
+    image: Image.Image
+    box: Box | None
+
+
+def crop_to_object(image: Image.Image, name: str) -> Prepared:
     """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module);
     stray parts far from the object are left out."""
     opacity = without_strays(image.getchannel("A"), name)
@@ -158,7 +203,7 @@ def crop_to_object(image: Image.Image, name: str) -> Image.Image:
     x0, y0, x1, y1 = (corners - np.tile(whole[:2], 2)).tolist()
     image = image.copy()
     image.putalpha(opacity)
-    return image.crop(whole).resize((SIZE, SIZE), Image.Resampling.LANCZOS, box=(x0, y0, x1, y1))
+    return Prepared(image.crop(whole).resize((SIZE, SIZE), Image.Resampling.LANCZOS, box=(x0, y0, x1, y1)), box)
 
 
 def prepare(
@@ -167,7 +212,7 @@ def prepare(
     """RGBA of `SIZE` pixels a side: by `cut_out` and `crop_to_object`, or, without `crop`, the whole image, which must
     be square; one without background then shows the object on white."""
     if crop:
-        return crop_to_object(cut_out(image, name, mask, remove_background), name)
+        return crop_to_object(cut_out(image, name, mask, remove_background), name).image
     if image.width != image.height:
         raise UserError(f"{name}: is {image.width} x {image.height} pixels; without crop an image must be square")
     whole = cut_out(image, name, mask, remove_background, required=False)
@@ -182,9 +227,11 @@ class Photograph(NamedTuple):
     mask: Image.Image | None
     made: bool
 
-    def prepared(self, crop: bool) -> Image.Image:
+    def prepared(self, crop: bool) -> Prepared:
         """See `prepare`."""
-        return prepare(self.image, self.name, self.mask, crop=crop)
+        if crop:
+            return crop_to_object(cut_out(self.image, self.name, self.mask), self.name)
+        return Prepared(prepare(self.image, self.name, self.mask, crop=False), None)
 
 
 def read_photographs(
@@ -220,7 +267,7 @@ def prepared_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
 ) -> list[Image.Image]:
     """Image files as `prepare` has them; see `read_photographs`."""
-    return [each.prepared(crop) for each in read_photographs(files, masks, remove_background, crop)]
+    return [each.prepared(crop).image for each in read_photographs(files, masks, remove_background, crop)]
 
 
 def on_white(image: Image.Image) -> NDArray[np.uint8]:

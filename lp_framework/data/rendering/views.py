@@ -27,11 +27,12 @@ from PIL import Image
 
 from lp_framework.atomic import DiskFull, written
 from lp_framework.data.cache import tracked
+from lp_framework.data.camera_files import nerf_transforms, view_cameras
 from lp_framework.data.files import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.meshes import MeshObject, fingerprint
 from lp_framework.data.origins import Origin
 from lp_framework.data.rendering.renderer import Renderer
-from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, nerf_transforms, write_transforms
+from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, write_transforms
 from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import camera_to_world
 
@@ -171,7 +172,9 @@ def render_object(
         views = renderer.views(scene, cameras, protocol.resolution, protocol.field_of_view_degrees)
         for split, poses in splits.items():
             names = [f"{index:03d}.png" for index in range(len(poses))]
-            transforms = nerf_transforms(names, torch.from_numpy(poses), protocol.field_of_view_degrees)
+            placed = torch.from_numpy(poses)
+            shown = view_cameras(names, placed, protocol.resolution, protocol.field_of_view_degrees)
+            transforms = nerf_transforms(shown, placed)
             for kind in ("rgb", "depth") if protocol.depth else ("rgb",):
                 (partial / split / kind).mkdir(parents=True)
             for name in names:
