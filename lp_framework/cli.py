@@ -21,6 +21,7 @@ COMMANDS = {  # the module of a command is lp_framework.commands.NAME
     "views": "Draw novel views around an object by a prior",
     "landscape": "Show a prior's energy over relative poses: of a pair of views, or around each object",
     "figure": "Draw a figure of the paper of your own data, prior and models",
+    "app": "Try it in a browser: photographs, landscapes and finished runs",
     "render": "Render meshes to views on disk",
     "convert": "Turn a Zero123 checkpoint, or a training run, into a folder of safetensors that loads in seconds",
     "bench": "Measure speed and memory against plain alternatives, side by side",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import gzip
-import importlib.util
 import json
 import math
 import re
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from exact_prior import ExactPrior, image_of
+from in_browser import PATIENCE, chromium, with_browser
 from page_runs import NASTY, STEPS, WRITERS, example, torch_equal, write_evaluation, write_training
 from PIL import Image
 
@@ -468,14 +468,6 @@ def test_report_of_runs_of_several_commands(lp, tmp_path):
 
 # ---------------------------------------------------------------- in a browser
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
-MISSING = [
-    *([] if CHROMIUM else ["a Chromium on the PATH (apt-get install chromium)"]),
-    *([] if importlib.util.find_spec("playwright") else ["pip install playwright"]),
-]
-with_browser = pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")
-SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-PATIENCE = 180_000  # milliseconds: without a GPU and on a busy machine relief takes long to draw
 DRAWN = """(place) => {
     const plot = document.querySelectorAll('.plot')[place];
     return plot.classList.contains('drawn') || !plot.checkVisibility();
@@ -484,12 +476,8 @@ DRAWN = """(place) => {
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE])
+    with chromium() as found:
         yield found
-        found.close()
 
 
 @pytest.fixture

@@ -155,16 +155,25 @@ def generated_views(
 
 
 @torch.no_grad()
-def model_field(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid) -> FieldValue:
-    """A model's scores `[B, A, O, 3]` and, of an energy model, energies `[B, A, O]`, at relative radii `[B]`."""
+def model_field(
+    model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid, sigma: float | None = None
+) -> FieldValue:
+    """A model's scores `[B, A, O, 3]` and, of an energy model, energies `[B, A, O]`, at relative radii `[B]`.
+
+    They are at the model's own `sigma`, or at another one, if it knows its field there.
+    """
     features = model.encode(pairs.images)
     condition = model.condition(features[pairs.reference], features[pairs.query])[:, None, None]
+    if sigma is not None and isinstance(model, PoseModel):
+        condition = model.at_sigma(condition, sigma)
     return model.field(condition, grid_poses(radius.to(pairs.images.device), *grid))
 
 
-def model_landscapes(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid) -> list[Landscape]:
+def model_landscapes(
+    model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid, sigma: float | None = None
+) -> list[Landscape]:
     """A model's energy over a grid for B pairs, at relative radii `[B]`; of a score model the length of the score."""
-    score, energy = model_field(model, pairs, radius, grid)
+    score, energy = model_field(model, pairs, radius, grid, sigma)
     values = (score.norm(dim=-1) if energy is None else energy).cpu()
     return [Landscape(*grid, *each) for each in zip(radius.tolist(), values, strict=True)]
 

@@ -228,15 +228,21 @@ def with_prior_energy(
     pairs: Pairs, shown: Sequence[ShownPair], prior: Prior, draws: fields.Draws, grid: Grid | None = None
 ) -> list[ShownPair]:
     """The pairs with the prior's landscape, on the paper's grid unless given, at the true relative radii or at 0."""
-    radius = torch.tensor([0.0 if pair.truth is None else float(pair.truth[2]) for pair in shown])
-    found = fields.prior_landscapes(prior, pairs, radius, grid or landscape_grid(), draws)
+    found = fields.prior_landscapes(prior, pairs, _radii(shown), grid or landscape_grid(), draws)
     return _with_landscapes(shown, PRIOR_ENERGY, found)
 
 
-def with_model_landscape(pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel) -> list[ShownPair]:
-    """The pairs with `model_landscapes` at their true relative radii."""
+def with_model_landscape(
+    pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel, sigma: float | None = None
+) -> list[ShownPair]:
+    """The pairs with `model_landscapes` at their true relative radii or at 0."""
     name = "energy of the model" if model.has_energy else "length of the model's score"
-    return _with_landscapes(shown, name, fields.model_landscapes(model, pairs, truths(shown)[:, 2], landscape_grid()))
+    found = fields.model_landscapes(model, pairs, _radii(shown), landscape_grid(), sigma)
+    return _with_landscapes(shown, name, found)
+
+
+def _radii(shown: Sequence[ShownPair]) -> Tensor:
+    return torch.tensor([0.0 if pair.truth is None else float(pair.truth[2]) for pair in shown])
 
 
 def _with_landscapes(shown: Sequence[ShownPair], name: str, found: Sequence[Landscape]) -> list[ShownPair]:

@@ -180,6 +180,28 @@ def surface_plot(pair: ShownPair) -> go.Figure:
     return _framed(figure, pair, moving)
 
 
+def add_way(figure: go.Figure, path: NDArray, name: str, colour: str, landscape: Landscape | None = None) -> None:
+    """Draw a further way `[S, 3]`, with a mark at its end, into a map, or into the surface of a landscape."""
+    along, on_map = (
+        (_along_map, _on_map) if landscape is None else (_raised(landscape, f) for f in (_along_map, _on_map))
+    )
+    figure.add_trace(_line(along(path), colour, 3 if landscape is None else 7))
+    _add_marks(figure, on_map(path[-1:]), name, colour, 12 if landscape is None else 7, symbol="diamond")
+
+
+def add_targets(figure: go.Figure, landscape: Landscape) -> None:
+    """Lay an invisible grid of 2 degrees over a map, whose points report clicks."""
+    latitude, longitude, energy = closed(landscape)
+    fine = np.arange(latitude[0], latitude[-1] + 1e-6, 2.0), np.arange(0.0, 360.0, 2.0)
+    values = RegularGridInterpolator((latitude, longitude), energy)(
+        np.stack(np.meshgrid(*fine, indexing="ij"), axis=-1)
+    )
+    figure.add_heatmap(
+        x=_numbers(fine[1]), y=_numbers(fine[0]), z=_numbers(values), opacity=0, showscale=False,
+        hovertemplate=f"{PLACE}: %{{z:.4g}}<extra></extra>",
+    )  # fmt: skip
+
+
 def pair_cameras_plot(pair: ShownPair) -> go.Figure:
     """The cameras of a pair around a globe that bears the landscapes: both with their images, and where the ways go."""
     reference = pair.reference.pose

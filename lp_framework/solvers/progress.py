@@ -5,11 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-_bars: ContextVar[Progress | None] = ContextVar("bars", default=None)
+
+class Bars(Protocol):
+    """What shows progress, as `rich.progress.Progress` does."""
+
+    def track(self, sequence: range, *, description: str) -> Iterable[int]:
+        """The numbers of a range, each shown as it is handed out."""
+
+
+_bars: ContextVar[Bars | None] = ContextVar("bars", default=None)
 
 
 @contextmanager
@@ -17,15 +26,24 @@ def shown_progress() -> Iterator[None]:
     """Solvers that run inside show their steps on the terminal, if there is one; the bars go when they are done."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        token = _bars.set(bars)
-        try:
-            yield
-        finally:
-            _bars.reset(token)
+    with (
+        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars,
+        progress_in(bars),
+    ):
+        yield
+
+
+@contextmanager
+def progress_in(bars: Bars) -> Iterator[None]:
+    """Solvers that run inside show their steps in these bars."""
+    token = _bars.set(bars)
+    try:
+        yield
+    finally:
+        _bars.reset(token)
 
 
 def steps_of(count: int, description: str) -> Iterable[int]:
-    """0 to `count` - 1, with a bar inside `shown_progress`."""
+    """0 to `count` - 1, with a bar inside `shown_progress` and `progress_in`."""
     bars = _bars.get()
     return range(count) if bars is None else bars.track(range(count), description=description)

@@ -1,0 +1,184 @@
+"""What every tab is made of: choices with their settings from `conf/`, and a request's progress."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import plotly.graph_objects as go
+import yaml
+from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_update
+from numpy.typing import NDArray
+
+from lp_framework import catalogue
+from lp_framework.app.jobs import Jobs
+from lp_framework.app.workbench import Choice
+from lp_framework.errors import UserError
+from lp_framework.report.page import picture
+
+# Settings that the command line alone gives: files of the machine on which the app runs, and what the app decides.
+NOT_OFFERED = ("name", "path", "weights", "trajectory")
+SIDE = 256  # pixels of an image
+TICK = 400  # milliseconds between two looks at a request
+
+
+def field(label: str, *content: Any) -> html.Div:
+    """A labelled part of a form."""
+    return html.Div([html.Label(label), *content], className="field")
+
+
+def choice(tab: str, group: str, label: str, value: str, names: Sequence[str]) -> html.Div:
+    """A choice of a group by name, with its settings folded in."""
+    key = {"tab": tab, "group": group}
+    settings = html.Details([html.Summary("settings"), html.Div(id={**key, "part": "settings"})], className="settings")
+    dropdown = dcc.Dropdown(list(names), value, id={**key, "part": "choice"}, clearable=False, searchable=False)
+    return field(label, dropdown, html.Small(id={**key, "part": "summary"}), settings)
+
+
+def settings_of(tab: str, group: str, name: str) -> list[Any]:
+    """An input for every setting of a choice, with the comment from its YAML file."""
+    rows: list[Any] = []
+    for key, block in catalogue.read(f"{group}/{name}").settings.items():
+        value, _, comment = block[-1].partition(": ")[2].partition(" # ")
+        if key in NOT_OFFERED or (len(block) > 1 and not block[0].startswith("#")):
+            continue
+        comment = comment or " ".join(line.strip("# ") for line in block[:-1])
+        identity = {"tab": tab, "group": group, "setting": key}
+        rows.append(field(key, dcc.Input(value.strip(), id=identity, debounce=True), html.Small(comment)))
+    return rows or [html.Small("There is nothing to set.")]
+
+
+def chosen(group: str, name: str, states: Sequence[Mapping[str, Any]]) -> Choice:
+    """A choice with the values of its inputs that are not those of its YAML file; `UserError` for what is no value."""
+    own, settings = catalogue.values(group, name), {}
+    for state in states:
+        key, text = state["id"]["setting"], state.get("value")
+        try:
+            value = yaml.safe_load(str(text))
+        except yaml.YAMLError as error:
+            raise UserError(f"{group}, {key}: '{text}' is no number, word or [list]") from error
+        if key in own and value != own[key]:
+            settings[key] = value
+    return Choice(name, settings)
+
+
+def progress(tab: str) -> html.Div:
+    """The bar of a tab's request with its button to cancel; hidden while nothing runs."""
+    return html.Div(
+        [
+            html.Progress(id=f"{tab}-bar", max="1"),
+            html.Span(id=f"{tab}-step", role="status"),
+            html.Button("Cancel", id=f"{tab}-cancel", className="quiet"),
+            dcc.Interval(id=f"{tab}-tick", interval=TICK, disabled=True),
+            dcc.Store(id=f"{tab}-job"),
+            dcc.Store(id=f"{tab}-done"),
+        ],
+        id=f"{tab}-progress",
+        className="progress",
+        hidden=True,
+    )
+
+
+def register_choices(app: Dash) -> None:
+    """Fill in what a choice means and its settings when another is chosen."""
+
+    @app.callback(
+        Output({"tab": MATCH, "group": MATCH, "part": "settings"}, "children"),
+        Output({"tab": MATCH, "group": MATCH, "part": "summary"}, "children"),
+        Input({"tab": MATCH, "group": MATCH, "part": "choice"}, "value"),
+    )
+    def fill(name: str) -> tuple[list[Any], str]:
+        tab, group = ctx.outputs_grouping[0]["id"]["tab"], ctx.outputs_grouping[0]["id"]["group"]
+        return settings_of(tab, group, name), catalogue.read(f"{group}/{name}").summary
+
+
+def register_progress(app: Dash, jobs: Jobs, tab: str) -> None:
+    """Follow a tab's request: `TAB-job` holds its name, `TAB-done` gets it at its end."""
+    # What a tick sets off is no consequence of the request for Dash, which allows no circles.
+    app.clientside_callback(
+        "(job) => [job === null, job === null]",
+        Output(f"{tab}-progress", "hidden"),
+        Output(f"{tab}-tick", "disabled"),
+        Input(f"{tab}-job", "data"),
+        prevent_initial_call=True,
+    )
+
+    @app.callback(
+        Output(f"{tab}-progress", "hidden", allow_duplicate=True),
+        Output(f"{tab}-tick", "disabled", allow_duplicate=True),
+        Output(f"{tab}-bar", "value"),
+        Output(f"{tab}-step", "children"),
+        Output(f"{tab}-done", "data"),
+        Input(f"{tab}-tick", "n_intervals"),
+        State(f"{tab}-job", "data"),
+        prevent_initial_call=True,
+    )
+    def follow(_: int, job: str) -> tuple[bool, bool, str | None, str, Any]:
+        if jobs.is_done(job):
+            return True, True, None, "", job
+        share, step = jobs.state(job)
+        return False, False, f"{share:.3f}", step, no_update
+
+    @app.callback(
+        Output(f"{tab}-cancel", "n_clicks"),
+        Input(f"{tab}-cancel", "n_clicks"),
+        State(f"{tab}-job", "data"),
+        prevent_initial_call=True,
+    )
+    def cancel(_: int, job: str) -> Any:
+        jobs.cancel(job)
+        return no_update
+
+
+def folded(title: str, content: Sequence[Any]) -> html.Details:
+    """Parts of a form that most visitors leave as they are."""
+    return html.Details([html.Summary(title), html.Div(content, className="form")], className="method")
+
+
+def slider(label: str, name: str, steps: tuple[float, float, float], marks: Mapping[float, str]) -> html.Div:
+    """A slider from a first to a last value by steps, 0 at first."""
+    named = {value: text.replace("-", "\N{MINUS SIGN}") for value, text in marks.items()}
+    return field(label, dcc.Slider(*steps, value=0, marks=named, id=name))
+
+
+def image(pixels: NDArray, caption: str) -> html.Figure:
+    """An image `[H, W, 3 or 4]` (uint8) above its caption."""
+    return html.Figure([html.Img(src=picture(pixels, SIDE), alt=caption), html.Figcaption(caption)], className="view")
+
+
+def plot(name: str, height: int) -> html.Figure:
+    """A plot that is filled by the output `NAME-figure`, in the colours of the page."""
+    graph = dcc.Graph(id=name, config={"displaylogo": False, "displayModeBar": False}, style={"height": f"{height}px"})
+    return html.Figure([dcc.Store(id=f"{name}-figure"), graph])
+
+
+def register_plot(app: Dash, name: str) -> None:
+    """Draw `NAME-figure` with the values of the page's CSS variables."""
+    app.clientside_callback(
+        "(figure) => window.inPageColours(figure)", Output(name, "figure"), Input(f"{name}-figure", "data")
+    )
+
+
+def for_page(figure: go.Figure) -> dict[str, Any]:
+    """A figure for `plot`: without the frames that the static page plays."""
+    content: dict[str, Any] = figure.update_layout(meta=None).to_plotly_json()
+    return content
+
+
+def selected(tab: str) -> list[State]:
+    """The states by which a callback learns a tab's choices and their settings; see `choices`."""
+    return [
+        State({"tab": tab, "group": ALL, "part": "choice"}, "value"),
+        State({"tab": tab, "group": ALL, "setting": ALL}, "value"),
+    ]
+
+
+def choices() -> dict[str, Choice]:
+    """The choices by group of the states of `selected`, inside their callback; `UserError` as in `chosen`."""
+    states = [state for states in ctx.states_list if isinstance(states, list) for state in states]
+    names = {state["id"]["group"]: state["value"] for state in states if "part" in state["id"]}
+    settings = [state for state in states if "setting" in state["id"]]
+    return {
+        group: chosen(group, name, [state for state in settings if state["id"]["group"] == group])
+        for group, name in names.items()
+    }

@@ -1,0 +1,135 @@
+"""The requests of all visitors, which run one after the other: there is one set of networks in memory."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from lp_framework.errors import UserError
+from lp_framework.solvers.progress import progress_in
+
+log = logging.getLogger(__name__)
+
+KEPT = 64  # requests whose results can still be fetched
+
+
+class Cancelled(UserError):
+    """A visitor has cancelled the request."""
+
+
+class Job:
+    """A request: what it waits for, how far it is, and what came of it."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self._work = work
+        self.step, self.done, self.total = "", 0, 0
+        self.warnings: list[str] = []
+        self.cancelled = False
+        self.future: Future[Any]
+
+    def track(self, sequence: range, *, description: str) -> Iterator[int]:
+        """See `progress.Bars`; raises `Cancelled` between two steps of a request that was cancelled."""
+        self.step, self.total = description, len(sequence)
+        for self.done, each in enumerate(sequence):
+            if self.cancelled:
+                raise Cancelled("cancelled")
+            yield each
+
+    def run(self) -> Any:
+        """The result of the request."""
+        if self.cancelled:
+            raise Cancelled("cancelled")
+        noted = Noted(self.warnings)
+        logging.getLogger().addHandler(noted)
+        try:
+            with progress_in(self):
+                return self._work()
+        finally:
+            logging.getLogger().removeHandler(noted)
+
+    @property
+    def share(self) -> float:
+        """How much of the present step is done, in [0, 1]."""
+        return self.done / self.total if self.total else 0.0
+
+
+class Noted(logging.Handler):
+    """Collects the warnings of its thread."""
+
+    def __init__(self, warnings: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._warnings, self._thread = warnings, threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            self._warnings.append(record.getMessage())
+
+
+class Jobs:
+    """Runs requests in turn, in one thread. A request has a name that no one else can guess."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lp-app")
+        self._jobs: OrderedDict[str, Job] = OrderedDict()
+
+    def submit(self, work: Callable[[], Any]) -> str:
+        """Queue a request; returns its name."""
+        name, job = secrets.token_urlsafe(16), Job(work)
+        job.future = self._thread.submit(job.run)
+        self._jobs[name] = job
+        for old in [each for each, other in self._jobs.items() if other.future.done()][:-KEPT]:
+            del self._jobs[old]
+        return name
+
+    def now(self, work: Callable[[], Any]) -> Any:
+        """Wait for a short request; its result, or what it raised."""
+        return self.result(self.submit(work))
+
+    def cancel(self, name: str) -> None:
+        """End a request before its next step."""
+        if name in self._jobs:
+            self._jobs[name].cancelled = True
+
+    def state(self, name: str) -> tuple[float, str]:
+        """How much of the present step of a request is done, and what a visitor reads of it."""
+        job = self._jobs.get(name)
+        if job is None or job.future.done():
+            return 1.0, ""
+        if not job.future.running():
+            waiting = [each for each in self._jobs.values() if not each.future.done()].index(job)
+            return 0.0, f"{waiting} request{'s' if waiting > 1 else ''} before this one"
+        count = f" {job.done + 1} of {job.total}" if job.total else ""
+        return job.share, f"{job.step}{count}" or "loading"
+
+    def is_done(self, name: str) -> bool:
+        """Whether a request has ended in some way."""
+        return name not in self._jobs or self._jobs[name].future.done()
+
+    def result(self, name: str) -> Any:
+        """What came of a request; raises `UserError` with a sentence for the visitor where nothing did."""
+        if name not in self._jobs:
+            raise UserError("the app has been started again; please send the request once more")
+        try:
+            return self._jobs[name].future.result()
+        except UserError:
+            raise
+        except Exception as error:
+            log.exception("a request failed")
+            raise UserError(
+                f"something went wrong ({type(error).__name__}: {error}); the log has the details"
+            ) from error
+
+    def warnings(self, name: str) -> list[str]:
+        """What the log was told during a request."""
+        return self._jobs[name].warnings
+
+    def close(self) -> None:
+        """Cancel everything and wait for the end of the present step."""
+        for job in self._jobs.values():
+            job.cancelled = True
+        self._thread.shutdown(cancel_futures=True)

@@ -1,0 +1,102 @@
+"""The app as a whole: its page, its tabs and the server behind them."""
+
+from __future__ import annotations
+
+import secrets
+from importlib import resources
+from pathlib import Path
+
+from dash import Dash, Input, Output, dcc, html
+from flask import Response, abort, send_from_directory
+
+from lp_framework.app import estimate, explore, forms
+from lp_framework.app.jobs import Jobs
+from lp_framework.app.visitors import Visitors
+from lp_framework.app.workbench import Workbench
+from lp_framework.models.checkpoints import SHIPPED
+from lp_framework.report.page import PAGE
+
+MOST_RUNS = 200  # pages that are listed, the latest first
+HTML = """<!DOCTYPE html>
+<html lang="en">
+<head>
+{{%metas%}}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<link rel="icon" href="data:,">
+<title>{{%title%}}</title>
+{{%css%}}
+<style>{style}</style>
+<script>{script}</script>
+</head>
+<body>
+{{%app_entry%}}
+<footer>{{%config%}}{{%scripts%}}{{%renderer%}}</footer>
+</body>
+</html>
+"""
+
+
+def make_app(
+    bench: Workbench, jobs: Jobs, visitors: Visitors, first: str, views: int, runs: Path, megabytes: float
+) -> Dash:
+    """The app; `runs` is the folder whose pages are shown, `megabytes` the most that one visitor may send at once."""
+    app = Dash("lp_framework", title="lp_framework", update_title="", assets_folder="")
+    style = _text("report/templates/page.css") + _text("app/app.css")
+    app.index_string = HTML.format(style=style, script=_text("app/app.js"))
+    app.server.config["MAX_CONTENT_LENGTH"] = int(megabytes * 2**20 * 1.4)  # in letters of base64
+    objects, prior = bench.data.source.names(), bench.own_prior.name
+    checkpoints = sorted(folder.name for folder in SHIPPED.iterdir() if folder.name != "tiny")
+
+    def page() -> html.Div:
+        tabs = {
+            "Estimate": estimate.layout(objects, checkpoints, prior, megabytes),
+            "Explore": explore.layout(objects, first, views, checkpoints, prior),
+            "Runs": _runs(runs),
+        }
+        names = [dcc.Tab(label=name, value=name) for name in tabs]
+        return html.Div(
+            [
+                html.Header(
+                    [html.H1("lp_framework"), html.P("The camera viewpoint between photographs of one object")]
+                ),
+                dcc.Store(id="visitor", data=secrets.token_urlsafe(16)),
+                html.Main(
+                    [
+                        dcc.Tabs(names, "Estimate", id="tabs", mobile_breakpoint=0),
+                        # All are there at all times, so that a tab is as it was when a visitor comes back to it.
+                        *(html.Div(content, id=f"tab-{name}", hidden=True) for name, content in tabs.items()),
+                    ]
+                ),
+            ]
+        )
+
+    app.layout = page
+    app.clientside_callback(
+        "(chosen) => window.shownTab(chosen, ['Estimate', 'Explore', 'Runs'])",
+        *(Output(f"tab-{name}", "hidden") for name in ("Estimate", "Explore", "Runs")),
+        Input("tabs", "value"),
+    )
+    forms.register_choices(app)
+    estimate.register(app, jobs, bench, visitors)
+    explore.register(app, jobs, bench)
+
+    @app.server.route("/runs/<path:file>")
+    def run_page(file: str) -> Response:
+        return send_from_directory(runs.absolute(), file) if Path(file).name == PAGE else abort(404)
+
+    return app
+
+
+def _runs(folder: Path) -> html.Div:
+    """Links to the pages of finished runs, the latest first."""
+    pages = sorted(folder.rglob(PAGE), key=lambda file: file.stat().st_mtime, reverse=True)[:MOST_RUNS]
+    links = [
+        html.Li(html.A(str(page.parent), href=f"/runs/{page.relative_to(folder)}", target="_blank")) for page in pages
+    ]
+    none = html.P(f"There is no finished run with a page in {folder}.", className="note")
+    return html.Div(html.Ul(links, className="runs") if links else none)
+
+
+def _text(file: str) -> str:
+    return resources.files("lp_framework").joinpath(file).read_text(encoding="utf-8")

@@ -1,0 +1,72 @@
+"""The files of visitors: below one temporary folder, which goes with the app."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+KEPT_SECONDS = 3600.0  # after a visitor's last request
+
+
+class Visitor:
+    """One opened page: the photographs that it has sent, their masks, and the folders of its results."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.seen = folder, time.monotonic()
+        self.files: list[Path] = []
+        self.masks: Path | None = None
+
+    def take_photographs(self, files: Iterable[tuple[str, bytes]]) -> None:
+        """Write photographs, names and contents, in place of those before."""
+        self.take_files(sorted(_written(self.new_folder(), files)))
+
+    def take_files(self, files: Sequence[Path]) -> None:
+        """Take files of this machine in place of those before; masks go as well."""
+        self.files, self.masks = list(files), None
+
+    def take_masks(self, files: Iterable[tuple[str, bytes]]) -> None:
+        """Write masks, names and contents, in place of those before."""
+        self.masks = self.new_folder()
+        _written(self.masks, files)
+
+    def new_folder(self) -> Path:
+        """An empty folder."""
+        folder = self.folder / secrets.token_hex(4)
+        folder.mkdir(parents=True)
+        return folder
+
+
+class Visitors:
+    """All visitors, by names that nobody can guess."""
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="lp-app-")
+        self._visitors: dict[str, Visitor] = {}
+
+    def __getitem__(self, name: str) -> Visitor:
+        """A visitor by name, a new one if need be; the files of those who have left are removed."""
+        now = time.monotonic()
+        for other, visitor in list(self._visitors.items()):
+            if other != name and now - visitor.seen > KEPT_SECONDS:
+                shutil.rmtree(self._visitors.pop(other).folder, ignore_errors=True)
+        visitor = self._visitors.setdefault(name, Visitor(Path(self._folder.name) / secrets.token_hex(8)))
+        visitor.seen = now
+        return visitor
+
+    def close(self) -> None:
+        """Remove all files."""
+        self._folder.cleanup()
+
+
+def _written(folder: Path, files: Iterable[tuple[str, bytes]]) -> list[Path]:
+    written = []
+    for name, content in files:
+        own = Path(name.replace("\\", "/")).name
+        path = folder / (own if own.strip(".") else "image")
+        path.write_bytes(content)
+        written.append(path)
+    return written

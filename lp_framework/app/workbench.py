@@ -1,0 +1,183 @@
+"""What the app's requests compute: the networks in memory, one of each kind, and the commands' functions on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lp_framework import catalogue, registry
+from lp_framework.analysis.estimates import Estimate, estimate
+from lp_framework.analysis.fields import Draws, generated_views, model_field, pose_energies
+from lp_framework.analysis.pairs import (
+    SAMPLING,
+    ShownPair,
+    named_pairs,
+    object_index,
+    solved_pairs,
+    with_model_landscape,
+    with_prior_energy,
+)
+from lp_framework.api import load_model, load_prior, load_solver, make_starts, move
+from lp_framework.app.jobs import Cancelled
+from lp_framework.data.module import PairDataModule
+from lp_framework.data.photographs import read_photographs
+from lp_framework.errors import UserError
+from lp_framework.models.pose_model import PoseModel
+from lp_framework.priors.base import Prior
+from lp_framework.solvers.base import Pairs, Solver
+
+T = TypeVar("T")
+
+
+class Choice(NamedTuple):
+    """A choice of a group by name, with settings in place of those of its YAML file."""
+
+    name: str
+    settings: Mapping[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a visitor has chosen."""
+
+    solver: Choice
+    start: Choice
+    prior: Choice
+    checkpoint: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A pair that is explored, on a device and as arrays with its landscapes, and what made them."""
+
+    pairs: Pairs
+    pair: ShownPair
+    prior: Prior
+    model: PoseModel
+    request: Request
+
+
+class Place(NamedTuple):
+    """What there is at a relative `pose` `[3]` of a scene: the view `[H, W, 3]` that the prior generates, the energies
+    of the landscapes by their names, and where a start from there goes by each solver, or why it does not."""
+
+    pose: Sequence[float]
+    view: NDArray
+    energies: Mapping[str, float]
+    ways: Mapping[str, ShownPair]
+    refusals: Mapping[str, str]
+
+
+class Workbench:
+    """The networks that the last request needed, and the data whose objects can be chosen. For one thread at a time."""
+
+    def __init__(
+        self, device: torch.device, data: PairDataModule, prior: Choice, draws: Draws, first: Tensor, seed: int
+    ) -> None:
+        self.device, self.data, self.draws, self.first, self.seed = device, data, draws, first, seed
+        self.own_prior = prior  # the command line's, which knows where its weights are
+        self._held: dict[str, tuple[object, Any]] = {}
+
+    def estimate(
+        self, files: Sequence[Path], masks: Path | None, crop: bool, request: Request
+    ) -> tuple[Estimate, list[ShownPair]]:
+        """The cameras of photographs, and the pairs of the first with each other one with their landscapes."""
+        photographs = read_photographs(files, masks, remove_background=crop, crop=crop)
+        solver, starts, needs = *self._solver(request), self._needs(request)
+        prior = self._prior(request.prior) if "prior" in needs else None
+        found = estimate(photographs, crop, solver, starts, prior, self.first, self.device, self.seed)
+        shown = list(found.shown)
+        if "model" in needs:
+            shown = with_model_landscape(found.pairs, shown, self._model(request.checkpoint), sigma_of(solver))
+        if prior is not None:
+            shown = with_prior_energy(found.pairs, shown, prior, self.draws)
+        return found, shown
+
+    def example(self, name: str, views: Sequence[int]) -> list[Path]:
+        """The files of some test views of an object."""
+        self.data.prepare_data()
+        table = self.data.table("test")
+        numbers = table.views_of(object_index(self.data, name))
+        return [table.files[numbers[view]] for view in views]
+
+    def scene(self, name: str, reference: int, query: int, request: Request) -> Scene:
+        """A pair of test views of an object with both landscapes, and where the solver goes from the starts."""
+        self.data.prepare_data()
+        pairs, shown = named_pairs(self.data, [name], [(reference, query)], self.device)
+        prior, model = self._prior(request.prior), self._model(request.checkpoint)
+        solver, starts = self._solver(request)
+        shown = with_prior_energy(pairs, shown, prior, self.draws)
+        shown = with_model_landscape(pairs, shown, model, sigma_of(solver))
+        (pair,) = solved_pairs(pairs, shown, solver, starts.make(pairs, self.seed), self.seed)
+        return Scene(pairs, pair.arrived(), prior, model, request)
+
+    @torch.no_grad()
+    def place(self, scene: Scene, pose: Sequence[float], solvers: Sequence[str]) -> Place:
+        """What there is at a relative pose (radians, object sizes) of a scene."""
+        here = torch.tensor([[pose]], dtype=torch.float32, device=self.device)  # [B = 1, N = 1, 3]
+        pairs, grid = scene.pairs, (here[0, :, 0].cpu(), here[0, :, 1].cpu())
+        code = scene.prior.encode(pairs.images[pairs.reference])
+        (view,) = generated_views(scene.prior, code, here[0].cpu(), *SAMPLING, self.seed)
+        score, energy = model_field(scene.model, pairs, here[0, :, 2], grid, sigma_of(self._solver(scene.request)[0]))
+        values = pose_energies(scene.prior, pairs, here, self.draws), score.norm(dim=-1) if energy is None else energy
+        energies = {name: value.item() for name, value in zip(scene.pair.landscapes, values, strict=True)}
+        ways, refusals = {}, {}
+        for solver in solvers:
+            try:
+                chosen, _ = self._solver(replace(scene.request, solver=Choice(solver)))
+                (ways[solver],) = solved_pairs(pairs, [scene.pair], chosen, here, self.seed)
+            except Cancelled:
+                raise
+            except UserError as error:
+                refusals[solver] = str(error)
+        return Place(pose, view, energies, ways, refusals)
+
+    def _needs(self, request: Request) -> list[str]:
+        """The components of the solver."""
+        return component_names("solver", request.solver)
+
+    def _solver(self, request: Request) -> tuple[Solver, Any]:
+        needs = {*self._needs(request), *component_names("start", request.start)}
+        parts: dict[str, Any] = {
+            "model": self._model(request.checkpoint) if "model" in needs else None,
+            "prior": self._prior(request.prior) if "prior" in needs else None,
+        }
+        solver = load_solver(request.solver.name, **parts, **request.solver.settings)
+        starts = make_starts(request.start.name, **parts, **request.start.settings)
+        move(solver, self.device)
+        move(starts, self.device)
+        return solver, starts
+
+    def _model(self, checkpoint: str) -> PoseModel:
+        return self._kept("model", checkpoint, lambda: load_model(checkpoint).to(self.device))
+
+    def _prior(self, choice: Choice) -> Prior:
+        own = self.own_prior.settings if choice.name == self.own_prior.name else {}
+        settings = {**own, **choice.settings}
+        key = choice.name, sorted(settings.items())
+        return self._kept("prior", key, lambda: load_prior(choice.name, **settings).to(self.device))
+
+    def _kept(self, kind: str, key: object, load: Callable[[], T]) -> T:
+        """What is in memory, if it is what is asked for; else the old one goes first."""
+        if self._held.get(kind, (None,))[0] != key:
+            self._held.pop(kind, None)
+            self._held[kind] = key, load()
+        found: T = self._held[kind][1]
+        return found
+
+
+def component_names(group: str, choice: Choice) -> list[str]:
+    """The components that a choice asks for, such as `model` and `prior`."""
+    return registry.component_names(registry.get(group, catalogue.values(group, choice.name)["name"]))
+
+
+def sigma_of(solver: Solver) -> float | None:
+    """The smoothing at which a solver ends, where it has one."""
+    sigmas = getattr(solver, "sigmas", None)
+    return sigmas[-1] if sigmas else None
