@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 from view_folders import draw_view, random_poses, write_object
 
-from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views
+from lp_framework.data import cache
+from lp_framework.data.cache import cached_array, content_key, decoded_views
 from lp_framework.errors import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -372,32 +373,34 @@ def test_a_transparent_pixels_colour_does_not_bleed_into_smaller_views(tmp_path)
     assert (images[0, :, :4] == [200, 0, 0]).all() and (images[0, :, 4:] == 255).all()
 
 
-# ---------------------------------------------------------------- opacity and depth
+# ---------------------------------------------------------------- other versions of the decoder
 
 
-def test_alpha_is_the_files_own_and_shrinks_as_the_views_do(files, tmp_path):
-    key, _ = decoded_views(files, 16, tmp_path / "cache")
-    alpha = decoded_alpha(files, 16, tmp_path / "cache", key)
-    np.testing.assert_array_equal(alpha, [np.asarray(Image.open(file))[..., 3] for file in files])
-    key, half = decoded_views(files, 8, tmp_path / "half")
-    alpha = decoded_alpha(files, 8, tmp_path / "half", key)
-    assert alpha.shape == (5, 8, 8) and alpha.dtype == np.uint8
-    assert (half[alpha == 0] == 255).all() and ((alpha > 0) & (alpha < 255)).any()
+@pytest.mark.parametrize("crop", [False, True])
+def test_views_that_were_decoded_otherwise_are_not_taken_but_their_content_is_the_same(tmp_path, monkeypatch, crop):
+    pixels = np.zeros((64, 64, 4), np.uint8)
+    pixels[20:40, 10:50] = (200, 0, 0, 255)
+    Image.fromarray(pixels).save(tmp_path / "view.png")
+
+    def decoded() -> tuple[str, np.ndarray]:
+        return decoded_views([tmp_path / "view.png"], 16, tmp_path / "cache", crop)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "on_white", lambda image: np.zeros((*image.size, 3), np.uint8))  # as black as it gets
+        key, wrong = decoded()
+    again, right = decoded()
+    assert (wrong == 0).all() and right.max() == 255 and again == key
 
 
-def test_depths_lie_beside_the_views_and_are_taken_at_the_nearest_sample(files, tmp_path):
+def test_16_bit_views_that_were_decoded_otherwise_are_not_taken(tmp_path, monkeypatch):
     levels = np.arange(256, dtype=np.uint16).reshape(16, 16) * 257
-    with pytest.raises(UserError, match=r"depth/000\.png: there is no such file; .*data\.depth=true"):
-        decoded_depths(files, 16, tmp_path / "cache")
-    (files[0].parents[1] / "depth").mkdir()
-    for shift, file in enumerate(files):
-        Image.fromarray(np.roll(levels, shift)).save(file.parents[1] / "depth" / file.name)
-    depths = decoded_depths(files, 16, tmp_path / "cache")
-    assert depths.shape == (5, 16, 16) and depths.dtype == np.float32
-    np.testing.assert_allclose(depths[0], levels * 1e-4, rtol=1e-6)
-    np.testing.assert_allclose(depths[3], np.roll(levels, 3) * 1e-4, rtol=1e-6)
-    half = decoded_depths(files, 8, tmp_path / "cache")
-    assert set(np.unique(half)) <= set(np.unique(depths))
+    Image.fromarray(levels).save(tmp_path / "view.png")
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "eight_bit", lambda image: image)  # Pillow's own conversion cuts off above 255
+        _, wrong = decoded_views([tmp_path / "view.png"], 16, tmp_path / "cache")
+    _, right = decoded_views([tmp_path / "view.png"], 16, tmp_path / "cache")
+    assert wrong[0, 1:].min() == 255
+    np.testing.assert_array_equal(right[0, ..., 0], levels // 257)
 
 
 # ---------------------------------------------------------------- images that are none

@@ -230,31 +230,6 @@ def test_features_are_computed_once_and_are_the_backbones(make):
     assert extractor.shown == 3 * (12 + 4)
 
 
-def test_batches_carry_alpha_and_depth_where_they_are_asked_for(make, root, opened):
-    plain = make()
-    batch = next(iter(plain.val_dataloader()))
-    assert batch.alpha is None is batch.depth
-    for file in root.glob("*/train/rgb/*.png"):
-        depth = file.parents[1] / "depth"
-        depth.mkdir(exist_ok=True)
-        Image.fromarray(np.full((16, 16), 10_000 + int(file.stem), np.uint16)).save(depth / file.name)
-    data = make()
-    data.carry("alpha", "depth")
-    data.prepare_data()
-    before = len(opened)
-    for loader in (data.train_dataloader(), data.val_dataloader()):
-        for batch in loader:
-            assert batch.alpha.dtype == torch.uint8 and batch.depth.dtype == torch.float32
-            assert batch.alpha.shape == batch.depth.shape == batch.pixels.shape[:3]
-            assert (batch.pixels[batch.alpha == 0] == 255).all()
-            numbers = torch.tensor([float(name.split("/")[1][:3]) for name in batch.names])
-            torch.testing.assert_close(batch.depth[:, 0, 0], 1 + numbers * 1e-4)
-    assert len(opened) == before  # all of it was decoded when it was prepared
-    data.cache_features(Means())
-    batch = next(iter(data.val_dataloader()))
-    assert batch.pixels is None and batch.alpha is not None and batch.depth is not None
-
-
 class Moving(torch.nn.Module):
     """A backbone that is really moved, if only to another type; its head is to be trained afterwards."""
 

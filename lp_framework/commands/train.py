@@ -66,7 +66,7 @@ def run(config: DictConfig) -> None:
     model.recipe = {"model": settings["model"], "backbone": settings["backbone"]}
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
-    data.carry(*model.carries)
+    data.carries_points = model.carries_points
     loggers: list[Logger] = [MetricsLogger(folder, checkpoint.get("global_step", 0))]
     if settings["logger"]["tensorboard"]:
         loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))

@@ -24,13 +24,12 @@ from rich.progress import track
 from lp_framework.atomic import reason
 from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import on_white, opened, prepare
-from lp_framework.data.views import DEPTH_UNIT
 from lp_framework.errors import UserError
 
 T = TypeVar("T")
 
 
-def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], Iterable[NDArray]]) -> NDArray:
+def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], Iterable[NDArray]]) -> np.memmap:
     """The array `[count, ...]` of a key, read-only and memory-mapped; where it is missing or damaged, it is made
     from `blocks`, which are `[n, ...]` of any one shape and type."""
     folder = Path(folder)
@@ -42,7 +41,7 @@ def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], 
     except OSError as error:
         why = reason(error, folder)
         raise UserError(f"{folder}: the cache cannot be written ({why}); set data.cache=FOLDER") from error
-    return np.load(folder / f"{key}.npy", mmap_mode="r")
+    return np.lib.format.open_memmap(folder / f"{key}.npy", mode="r")
 
 
 def _write(folder: Path, key: str, count: int, blocks: Iterable[NDArray]) -> None:
@@ -102,71 +101,50 @@ def content_key(files: Iterable[Path], *facts: object) -> str:
     return digest.hexdigest()
 
 
-def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bool = False) -> tuple[str, NDArray]:
-    """Key and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized; decoded once. With
-    `crop` the object is centred and scaled as that of a photograph, by the alpha channel (see `prepare`).
+def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bool = False) -> tuple[str, np.memmap]:
+    """Key of the content and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized;
+    decoded once by a version of this program. With `crop` the object is centred and scaled as that of a photograph, by
+    the alpha channel (see `prepare`).
 
     `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
 
-    def decode(image: Image.Image) -> NDArray:
+    def decode(image: Image.Image) -> NDArray[np.uint8]:
         called = str(getattr(image, "filename", "a view"))
         return pixels_on_white(prepare(eight_bit(image).convert("RGBA"), called) if crop else image, size)
 
+    def blocks() -> Iterator[NDArray[np.uint8]]:
+        sizes: dict[Path, tuple[int, int]] = {}
+        for file in tracked(files, "decoding views"):
+            with opened(file) as image:
+                told = f"{file}: is {image.width} x {image.height} pixels"
+                if image.width != image.height:
+                    raise UserError(f"{told}; views must be square")
+                width, height = sizes.setdefault(file.parent, image.size)
+                if image.size != (width, height):
+                    raise UserError(f"{told}, the other images of its folder are {width} x {height}")
+                block = decode(image)[None]
+            yield block
+
     key = content_key(files, "crops" if crop else "views", size)
-    return key, cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding views"))
+    answers = [decode(sample) for sample in sample_images()[: 1 if crop else 2]]
+    return key, cached_array(folder, answered_key(key, answers), len(files), blocks)
+
+
+def sample_images() -> list[Image.Image]:
+    """An image with a soft edge around an object in it, and a grey one of 16 bits."""
+    ramp = np.arange(64 * 64, dtype=np.uint16).reshape(64, 64) * 16
+    opacity = (24 - np.hypot(*np.mgrid[-31.5:32, -31.5:32])) * 32
+    soft = np.dstack([ramp / 257, ramp.T / 257, ramp % 256, opacity.clip(0, 255)]).astype(np.uint8)
+    return [Image.fromarray(soft), Image.fromarray(ramp)]
+
+
+def answered_key(key: str, answers: Iterable[NDArray]) -> str:
+    """The key of what a decoder makes of the files of `key`, which changes with what it makes of samples: its
+    `answers`. So arrays that an earlier version decoded otherwise are not taken."""
+    return content_key([], key, [hashlib.blake2b(answer.tobytes(), digest_size=8).hexdigest() for answer in answers])
 
 
 def pixels_on_white(image: Image.Image, size: int) -> NDArray[np.uint8]:
     """Pixels `[size, size, 3]` of a view, composed over white and resized."""
     white = Image.fromarray(on_white(eight_bit(image).convert("RGBA")))
     return np.asarray(white.resize((size, size), Image.Resampling.BOX))
-
-
-def decoded_alpha(files: Sequence[Path], size: int, folder: str | Path, views: str) -> NDArray:
-    """The opacity `[N, size, size]` (uint8) of image files, resized as `decoded_views` does, whose key is `views`."""
-
-    def decode(image: Image.Image) -> NDArray:
-        return np.asarray(eight_bit(image).convert("RGBA").getchannel("A").resize((size, size), Image.Resampling.BOX))
-
-    key = content_key([], "alpha", views)
-    return cached_array(folder, key, len(files), lambda: _decoded(files, decode, "decoding alpha"))
-
-
-def depth_files(files: Sequence[Path]) -> list[Path]:
-    """The depths that belong to image files; `UserError` where a view has none."""
-    depths = [file.parents[1] / "depth" / file.name for file in files]
-    if missing := [file for file in depths if not file.is_file()]:
-        raise UserError(f"{missing[0]}: there is no such file; views rendered with data.depth=true have depths")
-    return depths
-
-
-def decoded_depths(files: Sequence[Path], size: int, folder: str | Path) -> NDArray:
-    """The depths `[N, size, size]` (float32) that belong to image files (see `views`): along the optical axis, in scene
-    units, 0 where there is nothing; of the sample nearest to each pixel. `UserError` where a view has none."""
-    depths = depth_files(files)
-
-    def decode(image: Image.Image) -> NDArray:
-        return scene_depth(image.resize((size, size), Image.Resampling.NEAREST))
-
-    key = content_key(depths, "depths", size)
-    return cached_array(folder, key, len(depths), lambda: _decoded(depths, decode, "decoding depths"))
-
-
-def scene_depth(image: Image.Image) -> NDArray[np.float32]:
-    """Depths `[H, W]` in scene units of an image of their levels."""
-    return np.asarray(image).astype(np.float32) * np.float32(DEPTH_UNIT)
-
-
-def _decoded(files: Sequence[Path], decode: Callable[[Image.Image], NDArray], description: str) -> Iterator[NDArray]:
-    """What `decode` makes of every image file, `[1, ...]` each; `UserError` naming one that is not as it should be."""
-    sizes: dict[Path, tuple[int, int]] = {}
-    for file in tracked(files, description):
-        with opened(file) as image:
-            told = f"{file}: is {image.width} x {image.height} pixels"
-            if image.width != image.height:
-                raise UserError(f"{told}; views must be square")
-            width, height = sizes.setdefault(file.parent, image.size)
-            if image.size != (width, height):
-                raise UserError(f"{told}, the other images of its folder are {width} x {height}")
-            block = decode(image)[None]
-        yield block

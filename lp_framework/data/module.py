@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from lp_framework.data.cache import cached_array, content_key, decoded_alpha, decoded_depths, decoded_views, tracked
+from lp_framework.data.cache import cached_array, content_key, decoded_views, tracked
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
 from lp_framework.data.photographic import decoded_renderings
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, ObjectViews, ViewSource
@@ -81,7 +81,7 @@ class PairDataModule(LightningDataModule):
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
         self._extractor: FeatureExtractor | None = None
         self._answer: list[str] = []  # of it
-        self._carried: set[str] = set()
+        self.carries_points = False  # whether training batches have the points in space that depths tell
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images a set, where sets are evaluated
         self._evaluation_pairs = EVALUATION_PAIRS
@@ -174,35 +174,27 @@ class PairDataModule(LightningDataModule):
         """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
         self._extractor, self._answer = extractor, _answer(extractor, self.image_size)
 
-    def carry(self, *what: Literal["alpha", "depth", "points"]) -> None:
-        """From now on batches carry the views' alpha channels, the depths that were rendered with them, or (of training
-        views alone, together with `cropped`) the points in space that depths tell, as well."""
-        self._carried = {*what}
-
     def data(self, split: str) -> PairData:
         """The batches of a split, addressed by pairs."""
         table = self.table(split)
         # Training and validation views share one array, so that another way to divide them decodes nothing anew.
         files = [file for views in self._on_disk(split) for file in views.files]
         crop = self.crop and split in ("test", "all_train")
-        if _folder(split) == "train" and (self.photographs or "points" in self._carried):
+        if _folder(split) == "train" and (self.photographs or self.carries_points):
             key, views = decoded_renderings(self._on_disk(split), self.photographs, self.image_size, self.cache)
-            images = views["pixels"]
-            arrays = {"points": views["points"], "cropped": views["cropped"]}
+            arrays = {"images": views["pixels"], "points": views["points"], "cropped": views["cropped"]}
         else:
-            key, images = decoded_views(files, self.image_size, self.cache, crop)
-            arrays = {}
-        arrays["images"] = images
+            key, views = decoded_views(files, self.image_size, self.cache, crop)
+            arrays = {"images": views}
         self._image_keys[_folder(split)] = key
-        if "alpha" in self._carried:
-            arrays["alpha"] = decoded_alpha(files, self.image_size, self.cache, key)
-        if "depth" in self._carried:
-            arrays["depth"] = decoded_depths(files, self.image_size, self.cache)
         if (extractor := self._extractor) is not None:
-            feature_key = content_key([], "features", key, extractor.fingerprint(), self._answer)
+            # By the file of the decoded views, whose name tells how they were decoded.
+            feature_key = content_key(
+                [], "features", Path(str(views.filename)).stem, extractor.fingerprint(), self._answer
+            )
             device = self._device()
             arrays["features"] = cached_array(
-                self.cache, feature_key, len(files), lambda: _extracted(extractor, images, device)
+                self.cache, feature_key, len(files), lambda: _extracted(extractor, arrays["images"], device)
             )
         if files == table.files:
             return PairData(table, **arrays, crop=crop)

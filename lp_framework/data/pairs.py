@@ -36,8 +36,6 @@ class PairBatch:
     reference: Tensor  # [P], into the views
     query: Tensor  # [P]
     pairs: Tensor  # [P, 2], the same as rows of the view table
-    alpha: Tensor | None = None  # [I, H, W] (uint8)
-    depth: Tensor | None = None  # [I, H, W] (float32) along the optical axis in scene units, 0 where there is nothing
     points: Tensor | None = None  # [I, C^2, 3] (float16) that C x C cells show, in the object's frame, NaN: nothing
     cropped: Tensor | None = None  # [I], whether a view is a crop to the object, which has lost its distance
     field_of_view: Tensor | None = None  # [I], radians (float64), on the CPU; None: all are crops, which have lost it
@@ -147,8 +145,8 @@ class Rows:
 class PairData(Dataset[PairBatch]):
     """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
 
-    `images` (uint8), `features`, `alpha` and `depth`, where they are given, have a row a view of the table; `crop`:
-    all images are crops to the object.
+    `images` (uint8), `features`, `points` and `cropped` (see `PairBatch`), where they are given, have a row for each
+    view of the table. With `crop` all images are crops to the object.
     """
 
     def __init__(
@@ -156,13 +154,11 @@ class PairData(Dataset[PairBatch]):
         table: ViewTable,
         images: NDArray | Rows | None,
         features: NDArray | Rows | None = None,
-        alpha: NDArray | Rows | None = None,
-        depth: NDArray | Rows | None = None,
         points: NDArray | Rows | None = None,
         cropped: NDArray | Rows | None = None,
         crop: bool = False,
     ) -> None:
-        self.table, self.images, self.features, self.alpha, self.depth = table, images, features, alpha, depth
+        self.table, self.images, self.features = table, images, features
         self.points, self.cropped, self.crop = points, cropped, crop
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
@@ -183,8 +179,6 @@ class PairData(Dataset[PairBatch]):
             reference=torch.from_numpy(place[:, 0]),
             query=torch.from_numpy(place[:, 1]),
             pairs=torch.from_numpy(pairs),
-            alpha=rows(self.alpha),
-            depth=rows(self.depth),
             points=rows(self.points),
             cropped=rows(self.cropped),
             field_of_view=None if self.crop else self.table.field_of_view[index],

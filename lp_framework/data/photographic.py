@@ -18,10 +18,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
-from lp_framework.data.cache import cached_array, content_key, depth_files, pixels_on_white, scene_depth, tracked
+from lp_framework.data.cache import answered_key, cached_array, content_key, pixels_on_white, sample_images, tracked
 from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import EXTENT, SIZE, opened
-from lp_framework.data.views import ObjectViews
+from lp_framework.data.views import DEPTH_UNIT, ObjectViews
+from lp_framework.errors import UserError
 from lp_framework.keyed_random import stable_id
 
 ROLL_DEGREES = 10.0  # at most, to either side
@@ -102,40 +103,47 @@ def _warped(points: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray
 
 def decoded_renderings(
     views: Sequence[ObjectViews], share: float, size: int, folder: str | Path
-) -> tuple[str, NDArray]:
+) -> tuple[str, np.memmap]:
     """Key and array `[N]` of renderings with depth; those of `share` of the objects are made to look like photographs.
 
     A row has `pixels` (size, size, 3), uint8 on white; `points` (CELLS^2, 3), float16, that its cells show, in the
     object's frame, NaN where there is nothing; and `cropped`, whether it was made to look like a photograph.
     """
     files = [file for each in views for file in each.files]
+    depths = [file.parents[1] / "depth" / file.name for file in files]
+    if missing := [file for file in depths if not file.is_file()]:
+        raise UserError(f"{missing[0]}: there is no such file; views rendered with data.depth=true have depths")
     record = np.dtype([("pixels", "u1", (size, size, 3)), ("points", "f2", (CELLS * CELLS, 3)), ("cropped", "?")])
 
+    def decode(
+        image: Image.Image, levels: Image.Image, camera: NDArray, field_of_view: float, random: Generator | None
+    ) -> NDArray:
+        pixels, points = np.asarray(eight_bit(image).convert("RGBA")), _points(levels, camera, field_of_view)
+        if random is not None:
+            pixels, points = like_photograph(pixels, points, random)
+        row = np.zeros(1, record)
+        row["pixels"] = pixels_on_white(Image.fromarray(pixels), size)
+        row["points"], row["cropped"] = _in_cells(points), random is not None
+        return row
+
     def blocks() -> Iterator[NDArray]:
+        remaining = iter(depths)
         for each in tracked(views, "decoding renderings"):
-            block = np.zeros(len(each), record)
             cropped = np.random.default_rng(stable_id(each.name)).random() < share
-            seen = each.cameras.numpy(), each.field_of_view.tolist()
-            rows = zip(each.files, depth_files(each.files), *seen, strict=True)
-            for row, (file, depth, camera, field_of_view) in enumerate(rows):
-                with opened(file) as image, opened(depth) as levels:
-                    pixels = np.asarray(eight_bit(image).convert("RGBA"))
-                    points = _points(scene_depth(levels), camera, field_of_view)
-                random = np.random.default_rng(stable_id(f"{each.name}/{file.name}"))
-                if cropped:
-                    pixels, points = like_photograph(pixels, points, random)
-                block[row]["pixels"] = pixels_on_white(Image.fromarray(pixels), size)
-                block[row]["points"] = _in_cells(points)
-                block[row]["cropped"] = cropped
-            yield block
+            for file, camera, angle in zip(each.files, each.cameras.numpy(), each.field_of_view.tolist(), strict=True):
+                random = np.random.default_rng(stable_id(f"{each.name}/{file.name}")) if cropped else None
+                with opened(file) as image, opened(next(remaining)) as levels:
+                    yield decode(image, levels, camera, angle, random)
 
     seen_from = [(each.name, each.cameras.tolist(), each.field_of_view.tolist()) for each in views]
-    key = content_key([*files, *depth_files(files)], "renderings by object", share, size, CELLS, seen_from)
-    return key, cached_array(folder, key, len(files), blocks)
+    key = content_key([*files, *depths], "renderings by object", share, size, CELLS, seen_from)
+    answers = [decode(*sample_images(), np.eye(4), 1.0, each) for each in (None, np.random.default_rng(0))]
+    return key, cached_array(folder, answered_key(key, answers), len(files), blocks)
 
 
-def _points(depth: NDArray[np.float32], camera: NDArray, field_of_view: float) -> NDArray[np.float32]:
+def _points(levels: Image.Image, camera: NDArray, field_of_view: float) -> NDArray[np.float32]:
     """The points `[H, W, 3]` in space that the pixels of a depth image show, NaN where there is nothing."""
+    depth = np.asarray(levels).astype(np.float32) * np.float32(DEPTH_UNIT)
     height, width = depth.shape
     slope = math.tan(field_of_view / 2)
     x = ((np.arange(width) + 0.5) * 2 / width - 1) * slope

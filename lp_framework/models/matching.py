@@ -47,7 +47,7 @@ class MatchingModel(PoseModel):
     """
 
     backbone: EfficientNetLite0Maps
-    has_energy, has_density, choose_by, carries = True, True, "energy", ("points",)
+    has_energy, has_density, choose_by, carries_points = True, True, "energy", True
     pose_scale: Tensor
 
     def __init__(

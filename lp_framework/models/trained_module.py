@@ -23,7 +23,7 @@ class TrainedModule(LightningModule):
 
     recipe: Mapping[str, Any] | None = None
 
-    carries: tuple[Literal["alpha", "depth", "points"], ...] = ()  # what of the views its batches have besides images
+    carries_points = False  # whether its batches have the points in space that their views show
 
     def __init__(
         self,
