@@ -79,7 +79,7 @@ def main() -> int:
     except UserError as error:
         if full_error:
             raise
-        print(f"error: {' '.join(str(error).splitlines())}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return error.status
     return 0
 

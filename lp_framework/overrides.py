@@ -12,10 +12,10 @@ from collections.abc import Iterable, Sequence
 
 from lp_framework.errors import UserError
 
-# Settings that hold a path, or a list of paths.
+# Settings that hold a path, or a list of paths or of names.
 PATHS = re.compile(
     r"(images?|masks|checkpoint|resume|path|output|runs|plugins|data\.views|hydra\.(run|sweep)\.dir"
-    r"|.+\.(path|labels|renderings|cache))"
+    r"|data\.objects(?==\[)|[^=]+\.(path|labels|renderings|cache))="
 )
 PLAIN = re.compile(r"[\w./:@%+*?|-]+", re.ASCII)  # text to Hydra, unless it is one of the following
 OTHER_THAN_TEXT = re.compile(r"[-+]?[\d_]*\.?[\d_]+(e[-+]?\d+)?|[-+]?(inf|nan)|true|false", re.IGNORECASE)
@@ -49,7 +49,7 @@ def values_of(overrides: Iterable[str]) -> dict[str, str]:
 
 def _as_text(override: str) -> str:
     key, equals, value = override.partition("=")
-    if not equals or not PATHS.fullmatch(key.lstrip("+")) or HYDRAS_OWN.fullmatch(value):
+    if not equals or not PATHS.match(override.lstrip("+")) or HYDRAS_OWN.fullmatch(value):
         return override
     inside = value[1:-1] if value[:1] == "[" and value[-1:] == "]" else value
     if any(quote in inside for quote in "'\"") and "," in inside:

@@ -280,6 +280,10 @@ def test_scenes_are_drawn_once_and_kept(tmp_path):
     assert len(chosen) == 2
     write_category(root, "ball", views=1)
     assert CO3DData(str(root), **settings).names() == chosen
+    names = [f"vase-{SEQUENCE}", f"ball-{SEQUENCE}"]
+    assert CO3DData(str(root), **settings, objects=names).names() == names[::-1]
+    with pytest.raises(UserError, match=rf"there is no 'bal-{SEQUENCE}' in .*did you mean 'ball-{SEQUENCE}'"):
+        CO3DData(str(root), **settings, objects=[f"bal-{SEQUENCE}"]).names()
     with pytest.raises(UserError, match="4 objects are there, 29 are needed"):
         CO3DData(str(root), views=str(tmp_path / "others")).names()
 

@@ -292,7 +292,9 @@ def test_objects_that_cannot_be_converted_are_listed_and_the_others_are_ready(ma
     rewrite(tmp_path / "views" / "objects.json", lambda lists: lists.update(seen=["obj_000001"]))
     data = make(train_views=6)
     data.prepare()
-    assert data.names() == ["obj_000001"]
+    assert data.names() == ["obj_000001"] == make(objects="obj_000001").names()
+    with pytest.raises(UserError, match=r"there is no 'obj_000004' in .*hope; did you mean 'obj_000001'"):
+        make(objects=["obj_000004"]).names()
 
 
 def test_what_is_wrong_for_all_objects_is_said_once(make, root):

@@ -1,11 +1,15 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import trimesh
 
-from lp_framework.data.files import ObjectLists, drawn, kept_lists
-from lp_framework.data.sets.rendered import MeshData
+from lp_framework.data.files import ObjectLists, drawn, kept_lists, raise_failures
+from lp_framework.data.rendering.renderer import View
+from lp_framework.data.sets.rendered import MeshData, ToyData
+from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
 
 NAMES = [f"object_{index}" for index in range(12)]
@@ -68,8 +72,55 @@ def test_an_undivided_folder_is_all_seen_and_has_no_list(meshes):
     assert not (meshes.parent / "views").exists()
 
 
+def test_objects_are_chosen_by_name_whatever_the_division(meshes):
+    assert names(meshes, objects=["object_7", "object_10"], unseen=4) == ["object_10", "object_7"]
+    assert names(meshes, objects="object_3") == ["object_3"]
+    assert not (meshes.parent / "views").exists()
+    for wrong, hint in (("objekt_3", "; did you mean 'object_3'?"), ("unsen", "; did you mean 'unseen'?"), ("mug", "")):
+        with pytest.raises(UserError) as caught:
+            names(meshes, objects=[wrong])
+        assert str(caught.value) == f"data.objects: there is no '{wrong}' in {meshes}{hint}"
+    with pytest.raises(UserError, match=r"data\.objects is empty"):
+        names(meshes, objects=[])
+
+
+def test_only_the_chosen_objects_are_made_and_read(tmp_path):
+    grey = SimpleNamespace(name="grey", views=lambda scene, cameras, size, angle: map(grey_view, cameras))
+    toy = ToyData(grey, str(tmp_path / "toy"), 16, 1, train_views=1, workers=1, objects=["tram", "duck"])
+    toy.prepare()
+    assert toy.names() == ["duck", "tram"] == sorted(each.name for each in (tmp_path / "toy").glob("[a-z]*"))
+    views = RenderingsData(str(tmp_path / "toy"), ["tram"])
+    assert views.names() == ["tram"] and views.views("tram", "test").ambiguity == "twofold"
+    with pytest.raises(UserError, match=r"there is no 'trams' in .*toy; did you mean 'tram'\?"):
+        RenderingsData(str(tmp_path / "toy"), ["trams"]).names()
+    with pytest.raises(UserError, match="there is no 'goose' in data=toy"):
+        ToyData(grey, str(tmp_path / "toy"), objects=["goose"]).names()
+
+
+def grey_view(camera) -> View:
+    return View(np.full((16, 16, 4), 200, np.uint8))
+
+
 def test_bad_divisions(meshes):
     with pytest.raises(UserError, match="12 objects are there, 13 are needed"):
         names(meshes, unseen=12)
     with pytest.raises(UserError, match=r"data\.objects=unseen: there are none; set data\.unseen"):
         names(meshes, objects="unseen")
+
+
+def failed(failures: dict[str, str]) -> list[str]:
+    with pytest.raises(UserError) as caught:
+        raise_failures(failures, 90, "rendered")
+    return str(caught.value).splitlines()
+
+
+def test_failures_are_a_short_list():
+    assert failed({"mug": "no faces"}) == ["1 of 90 objects could not be rendered: mug: no faces"]
+    assert failed(dict.fromkeys(NAMES, "no OpenGL")) == [
+        "12 of 90 objects could not be rendered: object_0, object_1, object_2, object_3, object_4 and 7 more: no OpenGL"
+    ]
+    many = {name: f"{name}.ply: no faces" for name in NAMES} | {"vase": "object_11.ply: no faces"}
+    lines = failed(many)
+    assert lines[0] == "13 of 90 objects could not be rendered:" and lines[-1] == "  and 8 more"
+    assert lines[1:-1] == [f"  {name}: {name}.ply: no faces" for name in NAMES[:5]]
+    raise_failures({}, 90, "rendered")

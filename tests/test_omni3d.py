@@ -89,6 +89,13 @@ def test_images_are_copied_and_the_download_is_left_alone(data, root, tmp_path):
     assert (tmp_path / "views/dinosaur_002/test/transform.json").stat().st_mtime_ns == stamp
 
 
+def test_chosen_objects_are_converted_alone(root, tmp_path):
+    write_omni3d(root, "dinosaur_003")
+    source = Omni3DData(str(root), str(tmp_path / "views"), objects=["dinosaur_003"])
+    source.prepare()
+    assert source.names() == ["dinosaur_003"] == [each.name for each in (tmp_path / "views").glob("[a-z]*")]
+
+
 def test_a_folder_of_other_views_is_not_touched(root, data, tmp_path):
     write_object(tmp_path / "views", "dinosaur_002", train=2, test=2)
     data.evaluate_on("ordered", 0)

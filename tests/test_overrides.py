@@ -37,6 +37,8 @@ def test_lists_functions_interpolations_and_quotes():
     assert read("estimate", "images=null", "images='x y'") == {"images": "x y"}
     assert read("eval", "data.path=~/views") == {"data.path": str(Path.home() / "views")}
     assert read("eval", "plugins=/a/b", "seed=20240101") == {"plugins": ["/a/b"], "seed": 20240101}
+    assert read("eval", "data.objects=[42, IMG (1),mug]") == {"data.objects": ["42", "IMG (1)", "mug"]}
+    assert read("eval", "data.objects=500") == {"data.objects": 500}  # of procedural objects their number
     assert with_paths_as_text("eval", ["checkpoint=runs/a,20240101"]) == ["checkpoint=runs/a,'20240101'"]
     assert with_paths_as_text("eval", ["checkpoint=choice(a,b)"]) == ["checkpoint=choice(a,b)"]
 

@@ -53,6 +53,7 @@ def test_a_seeded_choice_is_kept_beside_the_views(tmp_path):
     assert len(seen) == 5 and len(unseen) == 2 and not set(seen) & set(unseen)
     write_gso(root, "Another", "One_more")
     assert gso(root).names() == seen and gso(root, objects="unseen").names() == unseen
+    assert gso(root, objects=["One_more", "Another"]).names() == ["Another", "One_more"]
     with pytest.raises(UserError, match="split_seed was 0, is 1"):
         gso(root, split_seed=1).names()
 

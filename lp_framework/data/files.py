@@ -22,11 +22,12 @@ from filelock import FileLock
 from torch import Tensor
 
 from lp_framework.atomic import writing, written
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, nearest
 from lp_framework.geometry import is_rotation, spherical_residual
 
 LIST = "objects.json"
 LARGEST_RESIDUAL = 1.0  # degrees; a camera further from a spherical one is refused
+SHOWN = 5  # names in a sentence, and lines in a list of failures
 
 
 def read_json(file: Path) -> Any:
@@ -59,6 +60,30 @@ def names_below(root: Path, names: Iterable[str], what: str, looked_for: object)
     if not found:
         raise UserError(f"{root}: holds no {what}; looked for {looked_for}")
     return found
+
+
+def chosen(names: Sequence[str], wanted: str | Sequence[str] | None, where: object) -> list[str]:
+    """The objects that `data.objects` names (`wanted`), sorted; all for None. `UserError` for one that is not among the
+    `names`, which are those in `where`."""
+    if wanted is None:
+        return sorted(names)
+    found = sorted({wanted} if isinstance(wanted, str) else {*wanted})
+    if not found:
+        raise UserError("data.objects is empty; it needs the name of an object")
+    for name in found:
+        if name not in names:
+            raise UserError(f"data.objects: there is no '{name}' in {where}{nearest(name, names)}")
+    return found
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first few names in a sentence, and how many others there are.
+
+    >>> listed(["mug", "vase"]), listed("abcdefg")
+    ('mug, vase', 'a, b, c, d, e and 2 more')
+    """
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
 
 
 def numbers(values: Any, *shape: int) -> Tensor:
@@ -124,14 +149,18 @@ def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
 
 
 def raise_failures(failures: Mapping[str, str], objects: int, done: str) -> None:
-    """One `UserError` for all objects of which one was raised, by name; what they share is said once."""
+    """One `UserError` for all objects of which one was raised, by name: what they share is said once, of many different
+    messages the first few are listed."""
     names: dict[str, list[str]] = {}
     for name, message in failures.items():
         names.setdefault(message, []).append(name)
-    told = [f"{', '.join(of_these)}: {message}" for message, of_these in names.items()]
-    if told:
-        listed = f" {told[0]}" if len(told) == 1 else "".join(f"\n  {each}" for each in told)
-        raise UserError(f"{len(failures)} of {objects} objects could not be {done}:{listed}")
+    lines = [f"{listed(of_these)}: {message}" for message, of_these in names.items()]
+    if len(lines) > SHOWN:
+        others = sum(len(of_these) for of_these in [*names.values()][SHOWN:])
+        lines = [*lines[:SHOWN], f"and {others} more"]
+    if lines:
+        told = f" {lines[0]}" if len(lines) == 1 else "".join(f"\n  {line}" for line in lines)
+        raise UserError(f"{len(failures)} of {objects} objects could not be {done}:{told}")
 
 
 class ObjectLists(NamedTuple):

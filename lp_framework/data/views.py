@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lp_framework.data.files import check_upright, expecting, names_below, numbers, read_json
+from lp_framework.data.files import check_upright, chosen, expecting, names_below, numbers, read_json
 from lp_framework.errors import UserError
 from lp_framework.geometry import view_pose
 from lp_framework.registry import register
@@ -135,11 +135,12 @@ class ViewSource(ABC):
 class RenderingsData(ViewSource):
     """A folder of views in iFusion's layout, such as its published renderings of GSO and OO3D."""
 
-    def __init__(self, path: str) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str, objects: str | Sequence[str] | None = None) -> None:
+        self.path, self.wanted = Path(path), objects
 
     def names(self) -> list[str]:
-        """The folders with a `train` or a `test` folder."""
+        """The folders with a `train` or a `test` folder, as far as they are chosen."""
         splits = (split for split in self.path.glob("*/*") if split.name in ("train", "test") and split.is_dir())
         names = (split.parent.name for split in splits if not split.parent.name.startswith("."))
-        return names_below(self.path, names, "views", f"{self.path}/OBJECT/train/{TRANSFORMS} and rgb/*.png beside it")
+        looked_for = f"{self.path}/OBJECT/train/{TRANSFORMS} and rgb/*.png beside it"
+        return chosen(names_below(self.path, names, "views", looked_for), self.wanted, self.path)

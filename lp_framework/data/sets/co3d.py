@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from torch import Tensor
 
-from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below, numbers, read_json
+from lp_framework.data.files import ObjectLists, chosen, drawn, expecting, kept_lists, names_below, numbers, read_json
 from lp_framework.data.masks import HALF
 from lp_framework.data.photographs import read_image
 from lp_framework.data.real_cameras import (
@@ -67,24 +67,29 @@ class CO3DData(PhotographedData):
         test_views: int = 8,
         resolution: int = 512,
         split_seed: int = 0,
+        objects: str | Sequence[str] | None = None,
     ) -> None:
-        super().__init__(path, views, train_views, test_views, resolution, split_seed)
+        super().__init__(path, views, train_views, test_views, resolution, split_seed, objects)
         self.subsets, self.scenes = list(subsets), scenes
 
     def demands(self) -> dict[str, Any]:
         return {**super().demands(), "subsets": self.subsets}
 
     def names(self) -> list[str]:
-        """The scenes, `<category>-<sequence>`."""
+        """The scenes, `<category>-<sequence>`: those that are chosen, or drawn."""
+        if self.wanted is not None:
+            return chosen(self._available(), self.wanted, self.download)
         how = {"subsets": self.subsets, "scenes": self.scenes, "split_seed": self.split_seed}
-        return kept_lists(self.path, how, self._choose).seen
+        return kept_lists(self.path, how, self._draw).seen
 
-    def _choose(self) -> ObjectLists:
+    def _draw(self) -> ObjectLists:
+        return drawn(self._available(), self.scenes, 0, self.split_seed, self.download)
+
+    def _available(self) -> list[str]:
         folders = self.download.glob("*")
         scenes = (f"{folder.name}-{sequence}" for folder in folders for sequence, _ in self._listed(folder))
         looked_for = (f"{self.download}/*/set_lists/set_lists_{subset}.json" for subset in self.subsets)
-        available = names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
-        return drawn(available, self.scenes, 0, self.split_seed, self.download)
+        return names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
 
     def _listed(self, folder: Path) -> set[tuple[str, int]]:
         """Sequence and frame number of every frame in the set lists that a category has; few have all."""

@@ -152,7 +152,14 @@ class PhotographedData(ConvertedSource):
     """Object-centric crops of photographs with cameras: so many views of each object, chosen with `split_seed`."""
 
     def __init__(
-        self, path: str, views: str, train_views: int, test_views: int, resolution: int, split_seed: int
+        self,
+        path: str,
+        views: str,
+        train_views: int,
+        test_views: int,
+        resolution: int,
+        split_seed: int,
+        objects: str | Sequence[str] | None,
     ) -> None:
         check_settings(
             "data",
@@ -162,7 +169,7 @@ class PhotographedData(ConvertedSource):
         )
         self.download, self.path = Path(path), Path(views)
         self.train_views, self.test_views = train_views, test_views
-        self.resolution, self.split_seed = resolution, split_seed
+        self.resolution, self.split_seed, self.wanted = resolution, split_seed, objects
 
     @abstractmethod
     def photographs(self, name: str) -> Annotated:

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.data.files import ObjectLists, expecting, kept_lists, numbers, read_json
+from lp_framework.data.files import ObjectLists, chosen, expecting, kept_lists, numbers, read_json
 from lp_framework.data.masks import HALF, mask_opacity
 from lp_framework.data.photographs import opened, read_mask
 from lp_framework.data.real_cameras import ObjectFrame, z_up_to_y_up
@@ -86,16 +86,18 @@ class HOPEv2Data(PhotographedData):
         least_visible: float = 0.8,
         resolution: int = 512,
         split_seed: int = 0,
+        objects: str | Sequence[str] | None = None,
     ) -> None:
-        super().__init__(path, views, train_views, test_views, resolution, split_seed)
+        super().__init__(path, views, train_views, test_views, resolution, split_seed, objects)
         self.splits, self.least_visible = list(splits), least_visible
 
     def demands(self) -> dict[str, Any]:
         return {**super().demands(), "splits": self.splits, "least_visible": self.least_visible}
 
     def names(self) -> list[str]:
-        """The objects that have a model, `obj_000001` and so on."""
-        return kept_lists(self.path, {}, lambda: ObjectLists([f"obj_{n:06d}" for n in sorted(self._frames())], [])).seen
+        """The objects that have a model, `obj_000001` and so on, as far as they are chosen."""
+        lists = kept_lists(self.path, {}, lambda: ObjectLists([f"obj_{n:06d}" for n in sorted(self._frames())], []))
+        return chosen(lists.seen, self.wanted, self.download)
 
     def annotations(self, name: str) -> list[Path]:
         scenes = sorted({each.scene for each in self._instances.get(int(name.removeprefix("obj_")), [])})

@@ -11,6 +11,7 @@ images stay as they are, and the scene is scaled until the median radius of an o
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.data.files import check_upright, expecting, names_below, numbers
+from lp_framework.data.files import check_upright, chosen, expecting, names_below, numbers
 from lp_framework.data.photographs import read_image
 from lp_framework.data.real_cameras import z_up_to_y_up
 from lp_framework.data.sets.converted import ConvertedSource, frame
@@ -34,13 +35,16 @@ RADIUS = 1.85
 class Omni3DData(ConvertedSource):
     """Views in ID-Pose's layout, all of them test views; converted into `views` on first use."""
 
-    def __init__(self, path: str, views: str | None = None) -> None:
-        self.download = Path(path)
+    def __init__(self, path: str, views: str | None = None, objects: str | Sequence[str] | None = None) -> None:
+        self.download, self.wanted = Path(path), objects
         self.path = Path(views or f"datasets/{self.download.resolve().name}")
 
     def names(self) -> list[str]:
         names = (folder.name for folder in self.download.glob("*") if (folder / "poses").is_dir())
-        return names_below(self.download, names, "views in ID-Pose's layout", f"{self.download}/OBJECT/poses/*.npy")
+        looked_for = f"{self.download}/OBJECT/poses/*.npy"
+        return chosen(
+            names_below(self.download, names, "views in ID-Pose's layout", looked_for), self.wanted, self.download
+        )
 
     def views(self, name: str, split: str) -> ObjectViews:
         if split != "test":

@@ -19,7 +19,7 @@ import yaml
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from lp_framework.data.files import ObjectLists, drawn, expecting, kept_lists, names_below
+from lp_framework.data.files import ObjectLists, chosen, drawn, expecting, kept_lists, listed, names_below
 from lp_framework.data.mesh_files.common import MissingColourWarning
 from lp_framework.data.meshes import MeshObject, load_scene
 from lp_framework.data.origins import Origin
@@ -69,7 +69,7 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
             key = "".join(f"{each}: " for each in first["loc"])
             raise UserError(f"{path}: object '{name}': {key}{first['msg']}, got {first['input']!r}") from error
     if left_out := sorted(set(names) - set(labels)):
-        warnings.warn(f"{path}: leaves out, so that they stay unlabelled: {', '.join(left_out)}", stacklevel=2)
+        warnings.warn(f"{path}: leaves out, so that they stay unlabelled: {listed(left_out)}", stacklevel=2)
     return labels
 
 
@@ -125,22 +125,26 @@ class ToyData(RenderedData):
         longitude_step_degrees: float = 15.0,
         depth: bool = False,
         workers: int | None = None,
+        objects: str | Sequence[str] | None = None,
     ) -> None:
         super().__init__(
             renderer, path, workers, resolution=resolution, test_views=test_views, train_views=train_views,
             latitude_step_degrees=latitude_step_degrees, longitude_step_degrees=longitude_step_degrees, depth=depth,
         )  # fmt: skip
+        self.wanted = objects
 
     def objects(self) -> list[MeshObject]:
-        return toy_objects()
+        every = {obj.name: obj for obj in toy_objects()}
+        return [every[name] for name in chosen([*every], self.wanted, "data=toy")]
 
 
 @register("data", "meshes")
 class MeshData(RenderedData):
     """A folder of meshes, in any formats that trimesh reads; rendered into `views`.
 
-    `unseen` of its objects are kept from training; `objects` says whether these or the others are in use. `labels` is
-    a YAML file with their ambiguity classes (see `read_labels`). The axis `up` of the files becomes our +Y.
+    `unseen` of its objects are kept from training; `objects` says whether these or the others are in use, or names
+    those that are. `labels` is a YAML file with their ambiguity classes (see `read_labels`). The axis `up` of the files
+    becomes our +Y.
     """
 
     seen: int | None = None  # how many there are to train on, all but the unseen ones by default
@@ -154,7 +158,7 @@ class MeshData(RenderedData):
         labels: str | None = None,
         up: Literal["y", "z"] = "y",
         unseen: int = 0,
-        objects: Literal["seen", "unseen"] = "seen",
+        objects: str | Sequence[str] = "seen",
         split_seed: int = 0,
         resolution: int = 512,
         test_views: int = 8,
@@ -173,7 +177,10 @@ class MeshData(RenderedData):
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:
-        """The objects in use, sorted by name (see `kept_lists`)."""
+        """The objects in use, sorted by name; of the seen and unseen ones see `kept_lists`."""
+        if self.which not in ("seen", "unseen"):
+            names = chosen([*self.available(), "seen", "unseen"], self.which, self.meshes)
+            return [self._object(name) for name in names]
         if self.seen is None and not self.unseen and self.which == "seen":
             return [self._object(name) for name in self.available()]
         how = {key: getattr(self, key) for key in ("seen", "unseen", "split_seed")}
@@ -258,7 +265,7 @@ class ScannedData(MeshData):
         renderings: str | None = None,
         seen: int = 70,
         unseen: int = 10,
-        objects: Literal["seen", "unseen"] = "seen",
+        objects: str | Sequence[str] = "seen",
         split_seed: int = 0,
         resolution: int = 512,
         test_views: int = 8,
