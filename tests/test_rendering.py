@@ -699,8 +699,18 @@ def test_a_file_of_labels_holds_for_all_objects_whatever_their_views_were_render
         assert ambiguities("ply: {ambiguity: continuous}") == ["continuous", "unlabelled"]
 
 
+class Noisy(RaycastRenderer):
+    """Warns of what a user cannot act on, and of what a user can."""
+
+    def views(self, *arguments):
+        np.log(np.zeros(1))
+        warnings.warn("\n the mesh has\n a hole", stacklevel=1)
+        return super().views(*arguments)
+
+
 @pytest.mark.heavy
-def test_processes_render_what_one_process_does_and_failures_are_listed_at_the_end(tmp_path):
+@pytest.mark.filterwarnings("ignore:the mesh has a hole")
+def test_processes_render_what_one_process_does_and_failures_are_listed_at_the_end(tmp_path, capfd):
     painted_box().export(tmp_path / "box.ply")
     vertex_coloured_torus().export(tmp_path / "torus.ply")
     trimesh.creation.box().export(tmp_path / "plain.stl")
@@ -708,11 +718,28 @@ def test_processes_render_what_one_process_does_and_failures_are_listed_at_the_e
     objects = [MeshObject(name, "unlabelled", partial(load_scene, tmp_path / file)) for name, file in names.items()]
     for folder, workers in (("one", 1), ("two", 2)):
         with (
-            pytest.warns(UserWarning, match=r"plain\.stl: .*no texture"),
+            pytest.warns(UserWarning, match=r"plain\.stl: .*no texture") as warned,
             pytest.raises(UserError, match="2 of 5 objects could not be rendered") as caught,
         ):
-            render_objects(objects, tmp_path / folder, SMALL, RaycastRenderer(), workers=workers)
+            render_objects(objects, tmp_path / folder, SMALL, Noisy(), workers=workers)
+        assert {str(each.message) for each in warned if "hole" in str(each.message)} == {"the mesh has a hole"}
+        assert {each.category for each in warned} == {UserWarning} and capfd.readouterr() == ("", "")
         assert "bad: " in str(caught.value) and "worse: " in str(caught.value)
         assert sorted(path.name for path in (tmp_path / folder).iterdir() if path.is_dir()) == ["box", "plain", "torus"]
     for name in ("box", "plain", "torus"):
         assert contents(tmp_path / "one" / name) == contents(tmp_path / "two" / name)
+
+
+def test_the_command_says_what_is_wrong_in_a_line_each(lp, tmp_path):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.box().export(meshes / "plain.stl")
+    (meshes / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nvt nan 0\nf 1/1 2/1 3/1\nf 1/1 2/1 4/1")
+    (meshes / "empty.obj").write_text("v 0 0 0")
+    (meshes / "text.ply").write_text("not a mesh")
+    settings = ("resolution=8", "train_views=1", "test_views=1", "workers=1", "path=meshes")
+    ran = lp("render", "renderer=raycast", "data=meshes", *(f"data.{each}" for each in settings))
+    said = [line for line in (ran.out + ran.err).splitlines() if not line.startswith("WARNING: meshes/")]
+    assert ran.status == 1 and (ran.out + ran.err).count("WARNING: meshes/") == 4
+    assert said[0] == "error: 2 of 4 objects could not be rendered:" and len(said) == 3
+    assert [line.partition(".")[0] for line in said[1:]] == ["  empty: meshes/empty", "  text: meshes/text"]

@@ -262,7 +262,8 @@ def _work(
             raise
         except UserError as error:
             failure = str(error)
-    return failure, [str(each.message) for each in caught if issubclass(each.category, UserWarning)]
+    # Others than those for users, such as NumPy's of a division by zero, tell them nothing.
+    return failure, [" ".join(str(each.message).split()) for each in caught if issubclass(each.category, UserWarning)]
 
 
 def _in_processes(
