@@ -58,10 +58,9 @@ def test_objects_that_are_left_out_are_named(file):
         ("mug: {ambiguity: [unique]}", r"object 'mug': ambiguity: .*, got \['unique'\]"),
         (
             "mug: {ambiguity: unique, unique_answer: maybe}",
-            r"object 'mug': unique_answer: .*valid boolean, got 'maybe'",
+            r"object 'mug': unique_answer: .*valid boolean.*, got 'maybe'",
         ),
         ("mug: {ambiguity: unique, unique_answr: true}", r"object 'mug': unique_answr: .*not permitted"),
-        ("mug: {ambiguity: unique, reason: 3}", r"object 'mug': reason: .*valid string, got 3"),
         ("- mug", r"must give every object its label, as in 'mug: \{ambiguity: unique\}'"),
         ("", r"must give every object its label"),
         ("mug: {ambiguity: unique", r"is not readable YAML \("),

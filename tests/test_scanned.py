@@ -8,7 +8,7 @@ from view_folders import write_object
 
 from lp_framework import registry
 from lp_framework.data.meshes import load_scene, surfaces
-from lp_framework.data.sets.rendered import GSOData, OO3DData, load_gso
+from lp_framework.data.sets.rendered import GSOData, OO3DData, load_scan
 from lp_framework.errors import UserError
 
 
@@ -27,7 +27,7 @@ def check_upright_and_painted(scene) -> None:
 
 def test_gso_objects_are_turned_upright_and_find_their_texture(tmp_path):
     write_gso(tmp_path, "Shark")
-    check_upright_and_painted(load_gso(tmp_path / "Shark" / "meshes" / "model.obj"))
+    check_upright_and_painted(load_scan(tmp_path / "Shark" / "meshes" / "model.obj", "z"))
 
 
 def test_omniobject3d_scans_are_upright_as_they_are(tmp_path):
@@ -75,7 +75,7 @@ def test_categories_with_an_underscore(tmp_path):
     root = write_oo3d(tmp_path / "raw_scans", *OO3D)
     data = OO3DData(None, str(root), views=str(tmp_path / "views"), seen=5, unseen=0)
     assert data.names() == sorted(OO3D)
-    assert all(data.file(name).is_file() for name in OO3D)
+    assert [data.files[name].parent.parent.name for name in OO3D] == OO3D
 
 
 def test_bad_downloads(tmp_path):
@@ -100,7 +100,7 @@ def test_damaged_objects(tmp_path):
     messages = ["its texture texture.png is not there", "model.obj: ", "model.obj: there is no"]
     for name, message in zip(GSO, messages, strict=False):
         with pytest.raises(UserError, match=message):
-            load_gso(root / name / "meshes" / "model.obj")
+            load_scan(root / name / "meshes" / "model.obj", "z")
 
 
 @pytest.mark.parametrize(

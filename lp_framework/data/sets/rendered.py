@@ -34,7 +34,7 @@ from lp_framework.registry import register
 class Label(BaseModel):
     """An object's ambiguity class and whether a view of it has one right longitude (None: as `MeshObject` has it)."""
 
-    model_config = ConfigDict(strict=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     ambiguity: Literal["unique", "twofold", "continuous"]
     unique_answer: bool | None = None
@@ -51,11 +51,8 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
     missing, no YAML, not in the folder, or no label.
     """
     with expecting(f"{path}: is not readable YAML"):
-        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
-        node = loader.get_single_node()
-        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
-            key.tag = "tag:yaml.org,2002:str"  # 42 and 007 are names, as they are written
-        content = None if node is None else loader.construct_document(node)
+        # Of text alone: 42 and 007 are names as they are written.
+        content = yaml.load(path.read_text(encoding="utf-8"), yaml.BaseLoader)
     if not isinstance(content, dict):
         raise UserError(f"{path}: must give every object its label, as in 'mug: {{ambiguity: unique}}'")
     labels = {}
@@ -179,38 +176,28 @@ class MeshData(RenderedData):
     def objects(self) -> list[MeshObject]:
         """The objects in use, sorted by name; of the seen and unseen ones see `kept_lists`."""
         if self.which not in ("seen", "unseen"):
-            names = chosen([*self.available(), "seen", "unseen"], self.which, self.meshes)
+            names = chosen([*self.files, "seen", "unseen"], self.which, self.meshes)
             return [self._object(name) for name in names]
         if self.seen is None and not self.unseen and self.which == "seen":
-            return [self._object(name) for name in self.available()]
+            return [self._object(name) for name in self.files]
         how = {key: getattr(self, key) for key in ("seen", "unseen", "split_seed")}
         how["renderings"] = None if self.renderings is None else self.renderings.name
         lists = kept_lists(self.path, how, self._choose)
         names = lists.unseen if self.which == "unseen" else lists.seen
         if not names:
-            hint = "set data.unseen to the number of unseen objects"
-            raise UserError(f"data.objects={self.which}: there are none; {hint}")
+            raise UserError(f"data.objects={self.which}: there are none; set data.unseen to their number")
         return [self._object(name) for name in names]
 
     def _choose(self) -> ObjectLists:
-        available = self.available()
         if self.renderings is None:
-            return drawn(available, self.seen, self.unseen, self.split_seed, self.meshes)
+            return drawn([*self.files], self.seen, self.unseen, self.split_seed, self.meshes)
         seen = RenderingsData(str(self.renderings)).names()
-        if missing := sorted({*seen} - {*available}):
+        if missing := sorted({*seen} - {*self.files}):
             of_these = f"{len(missing)} of the {len(seen)} objects of {self.renderings}"
             raise UserError(f"{self.meshes}: {of_these} are missing, such as {missing[0]}")
-        others = [name for name in available if name not in seen]
+        others = [name for name in self.files if name not in seen]
         unseen = drawn(others, 0, self.unseen, self.split_seed, self.meshes).unseen if self.unseen else []
         return ObjectLists(seen, unseen)
-
-    def available(self) -> list[str]:
-        """Names of the objects in the folder; `UserError`, with the files looked for, where there are none."""
-        return list(self._files)
-
-    def file(self, name: str) -> Path:
-        """The mesh of an object."""
-        return self._files.get(name, self.meshes / name)
 
     def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
         """What loads a mesh."""
@@ -219,8 +206,7 @@ class MeshData(RenderedData):
     def origins(self) -> dict[str, Origin]:
         """The mesh of each object, beside the materials, buffers and images that any of them may refer to."""
         beside = Origin(self._parts(self.meshes))
-        files = {name: self.file(name) for name in self.names()}
-        return {name: Origin([file], beside, self.up) for name, file in files.items() if file.is_file()}
+        return {name: Origin([self.files[name]], beside, self.up) for name in self.names() if name in self.files}
 
     def _parts(self, folder: Path) -> list[Path]:
         """The files below a folder that meshes refer to."""
@@ -229,13 +215,14 @@ class MeshData(RenderedData):
         return sorted(file for file in found if not file.is_relative_to(views) and file.name[0] != ".")
 
     def _object(self, name: str) -> MeshObject:
-        load, label = self.loader(self.file(name)), self._labels.get(name)
+        load, label = self.loader(self.files.get(name, self.meshes / name)), self._labels.get(name)
         if label is None:
             return MeshObject(name, "unlabelled", load)
         return MeshObject(name, label.ambiguity, load, label.unique_answer)
 
     @cached_property
-    def _files(self) -> dict[str, Path]:
+    def files(self) -> dict[str, Path]:
+        """The meshes in the folder by object; `UserError`, with the files looked for, where there are none."""
         formats = sorted(f".{suffix}" for suffix in trimesh.available_formats())
         names = (f.name for f in self.meshes.glob("*") if f.suffix.lower() in formats and f.name[0] != ".")
         files: dict[str, Path] = {}
@@ -247,7 +234,7 @@ class MeshData(RenderedData):
 
     @cached_property
     def _labels(self) -> dict[str, Label]:
-        return {} if self.labels is None else read_labels(self.labels, self._files, self.meshes)
+        return {} if self.labels is None else read_labels(self.labels, self.files, self.meshes)
 
 
 class ScannedData(MeshData):
@@ -255,7 +242,8 @@ class ScannedData(MeshData):
 
     release: ClassVar[str]
     what: ClassVar[str]  # there is in the download
-    layout: ClassVar[str]  # where the mesh of an object is, two folders below the one that has its name
+    layout: ClassVar[str]  # where the meshes are, each two folders below the one that has its object's name
+    axis: ClassVar[Literal["y", "z"]] = "y"  # which points up
 
     def __init__(
         self,
@@ -276,55 +264,44 @@ class ScannedData(MeshData):
         workers: int | None = None,
     ) -> None:
         super().__init__(
-            renderer, path, views or f"datasets/{self.release}", None, "y", unseen, objects, split_seed, resolution,
-            test_views, train_views, latitude_step_degrees, longitude_step_degrees, depth, workers,
+            renderer, path, views or f"datasets/{self.release}", None, self.axis, unseen, objects, split_seed,
+            resolution, test_views, train_views, latitude_step_degrees, longitude_step_degrees, depth, workers,
         )  # fmt: skip
         self.seen, self.renderings = seen, None if renderings is None else Path(renderings)
 
-    def file(self, name: str) -> Path:
-        return self.meshes / self.layout.format(name=name, category=name.rpartition("_")[0])
+    def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
+        return partial(load_scan, file, self.up)
+
+    @cached_property
+    def files(self) -> dict[str, Path]:
+        found = {file.parts[-3]: file for file in self.meshes.glob(self.layout)}
+        return {name: found[name] for name in names_below(self.meshes, found, self.what, self.meshes / self.layout)}
 
     def origins(self) -> dict[str, Origin]:
         """The mesh of each object and what lies in its folder."""
-        files = {name: self.file(name) for name in self.names()}
-        parts = {name: self._parts(file.parents[1]) for name, file in files.items()}
-        return {name: Origin([file, *parts[name]]) for name, file in files.items() if file.is_file()}
-
-    def available(self) -> list[str]:
-        pattern = self.layout.format(name="*", category="*")
-        names = (file.parts[-3] for file in self.meshes.glob(pattern))
-        sound = (name for name in names if self.file(name).is_file())
-        return names_below(self.meshes, sound, self.what, self.meshes / pattern)
+        files = {name: self.files[name] for name in self.names() if name in self.files}
+        return {name: Origin([file, *self._parts(file.parents[1])]) for name, file in files.items()}
 
 
-def load_scan(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] = ()) -> trimesh.Scene:
-    """`load_scene` of a scan, whose material and texture must be there; `UserError` where they are not."""
+def load_scan(path: Path, up: Literal["y", "z"]) -> trimesh.Scene:
+    """`load_scene` of a scan, whose material and texture must be there; `UserError` where they are not.
+
+    The materials of GSO name their textures without the folder in which they are released.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("error", MissingColourWarning)
-        return load_scene(path, up, folders)
-
-
-def load_gso(path: Path) -> trimesh.Scene:
-    """The normalised scene of an object of GSO, turned from +Z up to +Y up; its material names its texture without the
-    folder."""
-    return load_scan(path, "z", [path.parents[1] / "materials" / "textures"])
+        return load_scene(path, up, [path.parents[1] / "materials" / "textures"])
 
 
 @register("data", "gso")
 class GSOData(ScannedData):
-    """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`; rendered into `views` on first use."""
+    """Google Scanned Objects, `<path>/<Object>/meshes/model.obj`, +Z up; rendered into `views` on first use."""
 
-    release, what, layout = "gso", "objects of GSO", "{name}/meshes/model.obj"
-
-    def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
-        return partial(load_gso, file)
+    release, what, layout, axis = "gso", "objects of GSO", "*/meshes/model.obj", "z"
 
 
 @register("data", "oo3d")
 class OO3DData(ScannedData):
     """OmniObject3D, `<path>/<category>/<category_001>/Scan/Scan.obj`; rendered into `views` on first use."""
 
-    release, what, layout = "oo3d", "scans of OmniObject3D", "{category}/{name}/Scan/Scan.obj"
-
-    def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
-        return partial(load_scan, file)
+    release, what, layout = "oo3d", "scans of OmniObject3D", "*/*/Scan/Scan.obj"
