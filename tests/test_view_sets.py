@@ -79,7 +79,7 @@ def test_sets_of_all_views_have_all_ordered_pairs(data):
 
 
 def test_a_batch_holds_whole_sets(data):
-    data.evaluate_on_sets(4, batch_pairs=10)
+    data.evaluate_on("ordered", batch_pairs=10, views=4)
     data.prepare_data()
     batches = list(data.test_dataloader())
     assert [len(batch) for batch in batches] == [9, 9, 9, 3]  # three sets of three pairs, not ten pairs
@@ -96,7 +96,7 @@ def test_a_batch_holds_whole_sets(data):
 
 
 def test_a_solver_is_asked_for_sets_and_its_answers_come_back_image_by_image(data):
-    data.evaluate_on_sets(3)
+    data.evaluate_on("ordered", views=3)
     data.prepare_data()
     (batch,) = data.test_dataloader()
     evaluation = Evaluation(Remembering(), Random(2), seed=3, views=3)
@@ -117,7 +117,7 @@ def test_a_solver_is_asked_for_sets_and_its_answers_come_back_image_by_image(dat
 
 
 def test_a_sets_id_is_that_of_its_images_wherever_it_is_evaluated(data):
-    data.evaluate_on_sets(3)
+    data.evaluate_on("ordered", views=3)
     data.prepare_data()
     table, ids = data.table("test"), []
     order = [7, 2, 0]
@@ -136,7 +136,7 @@ def test_a_sets_id_is_that_of_its_images_wherever_it_is_evaluated(data):
 @pytest.mark.parametrize("views", [1, 9, 2.5, "many"])
 def test_how_many_images_there_may_be(data, views):
     with pytest.raises(UserError, match=f"views must be 2 to 8 images, or null for pairs; got {views}"):
-        data.evaluate_on_sets(views)
+        data.evaluate_on("ordered", views=views)
 
 
 # ---------------------------------------------------------------- the command

@@ -68,12 +68,7 @@ def run(config: DictConfig) -> None:
     batch_pairs = pairs_at_once(settings["batch_pairs"], solver, starts)
     seed, views, protocol = settings["seed"], settings["views"], settings["protocol"]
     evaluation = Evaluation(solver, starts, seed, kept, views)
-    if views is None:
-        data.evaluate_on(protocol, seed, batch_pairs)
-    elif protocol != "ordered":
-        raise UserError(f"protocol={protocol} is for pairs; views={views} has a protocol of its own, leave it out")
-    else:
-        data.evaluate_on_sets(views, batch_pairs)
+    data.evaluate_on(protocol, seed, batch_pairs, views)
     with building.resumable(folder, journal.FOLDER):
         trainer.test(evaluation, datamodule=data, verbose=False)
     evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather

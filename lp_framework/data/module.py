@@ -79,9 +79,9 @@ class PairDataModule(LightningDataModule):
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
         self.photographs, self.crop = photographs, crop
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
+        self.carries_points = False  # whether training batches have the points in space that depths tell
         self._extractor: FeatureExtractor | None = None
         self._answer: list[str] = []  # of it
-        self.carries_points = False  # whether training batches have the points in space that depths tell
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images a set, where sets are evaluated
         self._evaluation_pairs = EVALUATION_PAIRS
@@ -145,19 +145,20 @@ class PairDataModule(LightningDataModule):
         files, index = [views.files[index] for index in kept], torch.from_numpy(kept)
         return replace(views, files=files, cameras=views.cameras[index], field_of_view=views.field_of_view[index])
 
-    def evaluate_on(self, protocol: str, seed: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
-        """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them."""
-        self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), None, batch_pairs
+    def evaluate_on(
+        self, protocol: str, seed: int = 0, batch_pairs: int = EVALUATION_PAIRS, views: int | None = None
+    ) -> None:
+        """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them.
 
-    def evaluate_on_sets(self, views: int, batch_pairs: int = EVALUATION_PAIRS) -> None:
-        """From now on prepare only the test views; `test_dataloader` gives `ViewTable.view_sets` of so many images.
-
-        A set comes as the pairs of its first view with each other one, `views` - 1 in a row, a batch holds whole sets:
-        as many as make `batch_pairs` pairs, one at least.
+        With `views` these are `ViewTable.view_sets` of so many test views instead. A set comes as the pairs of its
+        first view with each other one, `views` - 1 in a row; a batch holds whole sets, as many as make `batch_pairs`
+        pairs, one at least.
         """
-        if not isinstance(views, int) or not 2 <= views <= LARGEST_SET:
+        if views is not None and (not isinstance(views, int) or not 2 <= views <= LARGEST_SET):
             raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
-        self._evaluation, self._views, self._evaluation_pairs = ("view_sets", 0), views, batch_pairs
+        if views is not None and protocol != "ordered":
+            raise UserError(f"protocol={protocol} is for pairs; views={views} has a protocol of its own, leave it out")
+        self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), views, batch_pairs
 
     def leave_out(self, pairs: Iterable[Sequence[int]]) -> None:
         """From now on `test_dataloader` leaves out the batches all of whose pairs (rows of the table) are among these.
@@ -196,8 +197,6 @@ class PairDataModule(LightningDataModule):
             arrays["features"] = cached_array(
                 self.cache, feature_key, len(files), lambda: _extracted(extractor, arrays["images"], device)
             )
-        if files == table.files:
-            return PairData(table, **arrays, crop=crop)
         place = {file: row for row, file in enumerate(files)}
         rows = np.array([place[file] for file in table.files])
         return PairData(table, **{name: Rows(array, rows) for name, array in arrays.items()}, crop=crop)

@@ -142,6 +142,7 @@ class Rows:
         return self.array[self.rows[index]]
 
 
+@dataclass(eq=False)
 class PairData(Dataset[PairBatch]):
     """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
 
@@ -149,17 +150,12 @@ class PairData(Dataset[PairBatch]):
     view of the table. With `crop` all images are crops to the object.
     """
 
-    def __init__(
-        self,
-        table: ViewTable,
-        images: NDArray | Rows | None,
-        features: NDArray | Rows | None = None,
-        points: NDArray | Rows | None = None,
-        cropped: NDArray | Rows | None = None,
-        crop: bool = False,
-    ) -> None:
-        self.table, self.images, self.features = table, images, features
-        self.points, self.cropped, self.crop = points, cropped, crop
+    table: ViewTable
+    images: NDArray | Rows | None
+    features: NDArray | Rows | None = None
+    points: NDArray | Rows | None = None
+    cropped: NDArray | Rows | None = None
+    crop: bool = False
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
         views, place = np.unique(pairs, return_inverse=True)

@@ -30,7 +30,7 @@ class Evaluation(LightningModule):
     Afterwards `metrics.compute()` gives the metrics, `metrics.rows()` a row a pair. With a `journal` every batch is
     kept as it comes, and batches that the journal has from an earlier run are not solved again.
 
-    With `views` it is of `solve_views` on the sets of so many images of `PairDataModule.evaluate_on_sets`. Judged are
+    With `views` it is of `solve_views` on the sets of so many images of `PairDataModule.evaluate_on`. Judged are
     the pairs of a set's first image, as reference, with its others. A set has one answer, so SR equals R.
     """
 

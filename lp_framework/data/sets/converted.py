@@ -187,16 +187,14 @@ class PhotographedData(ConvertedSource):
         photographs, points, left_out, remarks = self.photographs(name)
         views, more = sound_views(photographs, points)
         left_out += more
-        wanted = self.train_views + self.test_views
+        wanted, where = self.train_views + self.test_views, f"{self.download}: object '{name}'"
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items()))
         if len(views) < wanted:
-            raise UserError(
-                f"{self.download}: object '{name}' has {len(views)} usable views"
-                f"{f' ({reasons} are left out)' if reasons else ''}, but data.train_views={self.train_views} and "
-                f"data.test_views={self.test_views} ask for {wanted}"
-            )
+            without = f" ({reasons} are left out)" if reasons else ""
+            asked = f"data.train_views={self.train_views} and data.test_views={self.test_views} ask for {wanted}"
+            raise UserError(f"{where} has {len(views)} usable views{without}, but {asked}")
         if reasons:
-            warnings.warn(f"{self.download}: object '{name}': {reasons} are left out", stacklevel=2)
+            warnings.warn(f"{where}: {reasons} are left out", stacklevel=2)
         places = torch.stack([view.photograph.camera[:3, 3] for view in views])
         directions = torch.nn.functional.normalize(places, dim=-1).numpy()
         random = np.random.default_rng([self.split_seed, stable_id(name)])
@@ -210,14 +208,14 @@ class PhotographedData(ConvertedSource):
                 crop(views[index], self.resolution).save(folder / split / "rgb" / file, compress_level=1)
                 frames.append(self._frame(file, views[index]))
             write_transforms(folder / split, frames)
-        taken = [views[index] for index in chosen]
-        files = [file for view in taken for file in (view.photograph.file, view.photograph.mask)]
+        photographs, _, turns, residuals = zip(*(views[index] for index in chosen), strict=True)
+        files = [file for photograph in photographs for file in (photograph.file, photograph.mask)]
         return [*self.annotations(name), *files], {
             **remarks,
             "left_out": dict(left_out),
-            "median_perspective_residual": float(np.median([view.residual for view in taken])),
-            "largest_perspective_residual": max(view.residual for view in taken),
-            "largest_turn_degrees": max(view.turn for view in taken),
+            "median_perspective_residual": float(np.median(residuals)),
+            "largest_perspective_residual": max(residuals),
+            "largest_turn_degrees": max(turns),
         }
 
     def _frame(self, file: str, view: SphericalView) -> dict[str, Any]:
@@ -249,23 +247,22 @@ class SphericalView(NamedTuple):
 def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list[SphericalView], Counter[str]]:
     """The views of an object that are near enough to a spherical camera's, and how many are not, by reason; `points`
     `[P, 3]` are on its bounding box."""
-    left_out: Counter[str] = Counter()
     if not photographs:
-        return [], left_out
+        return [], Counter()
     cameras = torch.stack([photograph.camera for photograph in photographs])
     distances = cameras[:, :3, 3].norm(dim=-1)
     radii = real_cameras.effective_radii(distances)
     residuals = real_cameras.perspective_residual(cameras, radii, points)
     _, turns = real_cameras.turn_towards_centre(cameras)
-    views = []
-    for index, photograph in enumerate(photographs):
-        if distances[index] < NEAREST:
-            left_out["nearer than the object is long"] += 1
-        elif not residuals[index] <= LARGEST_PERSPECTIVE:
-            left_out["with too strong a perspective"] += 1
-        else:
-            views.append(SphericalView(photograph, radii[index], turns[index].item(), residuals[index].item()))
-    return views, left_out
+    near, distorted = distances < NEAREST, ~(residuals <= LARGEST_PERSPECTIVE)
+    left_out = Counter(
+        {
+            "nearer than the object is long": int(near.sum()),
+            "with too strong a perspective": int((distorted & ~near).sum()),
+        }
+    )
+    views = map(SphericalView, photographs, radii, turns.tolist(), residuals.tolist())
+    return [view for view, wrong in zip(views, near | distorted, strict=True) if not wrong], +left_out
 
 
 def spread(directions: NDArray[np.floating], count: int, random: np.random.Generator) -> NDArray[np.int64]:
@@ -287,8 +284,11 @@ def crop(view: SphericalView, size: int) -> Image.Image:
     cut = photograph.colours()
     cut.putalpha(photograph.opacity())
     homography = real_cameras.crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
-    # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing.
-    larger = max(1, math.ceil(_magnification(homography, size) - 0.05))
+    # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing: by how many
+    # pixels of the photograph one of the crop is wide, in its middle.
+    middle = torch.tensor([[size / 2, size / 2, 1.0], [size / 2 + 1, size / 2, 1.0]], dtype=torch.float64)
+    seen = middle @ homography.mT
+    larger = max(1, math.ceil((seen[1, :2] / seen[1, 2] - seen[0, :2] / seen[0, 2]).norm().item() - 0.05))
     homography = homography / torch.tensor([larger, larger, 1.0], dtype=torch.float64)
     coefficients = (homography / homography[2, 2]).flatten()[:8].tolist()
     sides = (size * larger, size * larger)
@@ -298,10 +298,3 @@ def crop(view: SphericalView, size: int) -> Image.Image:
         raise UserError(f"{photograph.mask}: marks nothing where the annotation has the object")
     pixels[pixels[..., 3] == 0] = 0
     return Image.fromarray(pixels)
-
-
-def _magnification(homography: Tensor, size: int) -> float:
-    """Pixels of the photograph that one of the crop is wide, in its middle."""
-    middle = torch.tensor([[size / 2, size / 2, 1.0], [size / 2 + 1, size / 2, 1.0]], dtype=torch.float64)
-    seen = middle @ homography.mT
-    return (seen[1, :2] / seen[1, 2] - seen[0, :2] / seen[0, 2]).norm().item()
