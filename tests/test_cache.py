@@ -12,7 +12,8 @@ from PIL import Image
 from view_folders import draw_view, random_poses, write_object
 
 from lp_framework.data import cache
-from lp_framework.data.cache import cached_array, content_key, decoded_views
+from lp_framework.data.cache import cached_array, decoded_views
+from lp_framework.data.files import content_key
 from lp_framework.errors import UserError
 
 ROOT = Path(__file__).parents[1]

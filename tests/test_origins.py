@@ -15,7 +15,7 @@ from bop_layout import write_hopev2
 from co3d_layout import write_category
 from test_omni3d import write_omni3d
 
-from lp_framework.data.origins import Origin
+from lp_framework.data.files import Origin
 from lp_framework.data.sets.co3d import CO3DData
 from lp_framework.data.sets.converted import ConvertedSource
 from lp_framework.data.sets.hopev2 import HOPEv2Data

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import track
 
 from lp_framework.atomic import reason
+from lp_framework.data.files import content_key
 from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import on_white, opened, prepare
 from lp_framework.errors import UserError
@@ -88,17 +89,6 @@ def tracked(items: Iterable[T], description: str, total: int | None = None) -> I
     """The items, with a progress bar on the terminal while they last; nothing is printed elsewhere."""
     console = Console(stderr=True)
     return track(items, description, total, console=console, transient=True, disable=not console.is_terminal)
-
-
-def content_key(files: Iterable[Path], *facts: object) -> str:
-    """A key for what is computed from the bytes of `files`, in their order, and from `facts`."""
-    digest = hashlib.blake2b(repr(facts).encode(), digest_size=16)
-    for file in files:
-        try:
-            digest.update(hashlib.blake2b(file.read_bytes()).digest())
-        except OSError as error:
-            raise UserError(f"{file}: cannot be read ({error.strerror})") from error
-    return digest.hexdigest()
 
 
 def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bool = False) -> tuple[str, np.memmap]:

@@ -1,7 +1,8 @@
 """Files read and folders written: whatever is wrong with one is told in a sentence that names it.
 
 An object's folder of views is complete or absent, whatever stops the run: it is written as a hidden folder that is
-renamed when all of it is there. A record beside the views says what they were made from. `objects.json` in the folder
+renamed when all of it is there. A record beside the views says what they were made from, so that they are not taken for
+those of other files of the same names (see `Origin`). `objects.json` in the folder
 of all, `{"chosen": {how}, "seen": [names], "unseen": [names]}`, keeps which objects were chosen: a later run, with more
 of the data set downloaded, has the same.
 """
@@ -9,10 +10,14 @@ of the data set downloaded, has the same.
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -127,6 +132,47 @@ def written_folder(folder: Path) -> Iterator[Path]:
             partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def content_key(files: Iterable[Path], *facts: object) -> str:
+    """A key for what is computed from the bytes of `files`, in their order, and from `facts`."""
+    digest = hashlib.blake2b(repr(facts).encode(), digest_size=16)
+    for file in files:
+        try:
+            digest.update(hashlib.blake2b(file.read_bytes()).digest())
+        except OSError as error:
+            raise UserError(f"{file}: cannot be read ({error.strerror})") from error
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The files that an object's views are made from, others `beside` them that may belong to several objects, and the
+    axis that is `up` in them."""
+
+    files: Sequence[Path]
+    beside: Origin | None = None
+    up: str = "y"
+
+    @cached_property
+    def content(self) -> str:
+        """A text that changes with the names and bytes of the files."""
+        return content_key(self.files, [file.name for file in self.files], self.beside and self.beside.content, self.up)
+
+    @cached_property
+    def stamp(self) -> str:
+        """A text that changes with their places, sizes and times, which costs no reading."""
+        stats = [(os.path.abspath(file), file.stat()) for file in self.files]
+        facts = [(path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for path, stat in stats]
+        return content_key([], facts, self.beside and self.beside.stamp, self.up)
+
+    def record(self) -> dict[str, str]:
+        """What a record is to keep of the files."""
+        return {"content": self.content, "stamp": self.stamp}
+
+    def is_of(self, record: Any) -> bool:
+        """Whether a record is of these files; they are read where they are not where and as they were."""
+        return isinstance(record, dict) and (record.get("stamp") == self.stamp or record.get("content") == self.content)
 
 
 def read_record(file: Path) -> dict[str, Any]:

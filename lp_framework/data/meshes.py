@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -74,8 +74,8 @@ class Surface:
     twins: NDArray[np.int64]  # [T], index among the triangles of all surfaces of the one that backs this one, or -1
     colour: NDArray[np.float32]  # [3]
     corner_colours: NDArray[np.float32] | None  # [3T, 3]
-    texture: NDArray[np.uint8] | None  # [h, w, 3], powers of two, first row on top
-    texture_coordinates: NDArray[np.float32] | None  # [3T, 2], v upwards
+    texture: NDArray[np.uint8] | None = None  # [h, w, 3], powers of two, first row on top
+    texture_coordinates: NDArray[np.float32] | None = None  # [3T, 2], v upwards
     wrap: NDArray[np.int64] | None = None  # [2], how it goes on across and up (OpenGL's numbers); None: repeats
 
 
@@ -161,20 +161,15 @@ def surfaces(scene: trimesh.Scene) -> list[Surface]:
 
 def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.int64]) -> Surface:
     corners = mesh.faces[faces].reshape(-1)
+    positions, normals = mesh.vertices[corners].astype(np.float32), _corner_normals(mesh.triangles[faces])
     image, colour = _image(mesh), _factor(mesh)
     if colour is None:
         colour = np.full(3, 1.0 if _has_colour(mesh) else NEUTRAL_GREY)
-    coordinates, wrap = (None, None) if image is None else _mapping(mesh, corners)
-    return Surface(
-        positions=mesh.vertices[corners].astype(np.float32),
-        normals=_corner_normals(mesh.triangles[faces]),
-        twins=twins,
-        colour=colour.astype(np.float32),
-        corner_colours=_corner_colours(mesh, faces),
-        texture=None if image is None else _texture(image),
-        texture_coordinates=coordinates,
-        wrap=wrap,
-    )
+    painted = Surface(positions, normals, twins, colour.astype(np.float32), _corner_colours(mesh, faces))
+    if image is None:
+        return painted
+    coordinates, wrap = _mapping(mesh, corners)
+    return replace(painted, texture=_texture(image), texture_coordinates=coordinates, wrap=wrap)
 
 
 def _mapping(mesh: trimesh.Trimesh, corners: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64] | None]:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from lp_framework.data.cache import cached_array, content_key, decoded_views, tracked
+from lp_framework.data.cache import cached_array, decoded_views, tracked
+from lp_framework.data.files import content_key
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
 from lp_framework.data.photographic import decoded_renderings
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, ObjectViews, ViewSource

@@ -18,7 +18,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
-from lp_framework.data.cache import answered_key, cached_array, content_key, pixels_on_white, sample_images, tracked
+from lp_framework.data.cache import answered_key, cached_array, pixels_on_white, sample_images, tracked
+from lp_framework.data.files import content_key
 from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import EXTENT, SIZE, opened
 from lp_framework.data.views import DEPTH_UNIT, ObjectViews

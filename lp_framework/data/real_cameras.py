@@ -200,8 +200,7 @@ def agreeing_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.
     """
     boxes = _boxes(pixels)
     middles, lengths = boxes.mean(dim=1), (boxes[:, 1] - boxes[:, 0]).amax(dim=-1)
-    seen = torch.linalg.solve(intrinsics, torch.cat([middles, torch.ones_like(middles[:, :1])], dim=-1))
-    rays = (cameras[:, :3, :3] @ (seen * seen.new_tensor([1.0, -1.0, -1.0]))[..., None]).squeeze(-1)
+    rays = _rays(cameras[:, :3, :3], intrinsics, middles[:, None])[:, 0]
     pairs = _some(torch.combinations(torch.arange(len(cameras))), CANDIDATES)
     points = _nearest_point(cameras[pairs, :3, 3], rays[pairs])
     offsets = (project(cameras, intrinsics, points) - middles[:, None]).norm(dim=-1)  # [V, P]
@@ -232,7 +231,8 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
     centre's distance. Raises `ValueError` where the cameras do not go round the object.
     """
     axes = _axes(cameras)
-    rays = [_rays(*each) for each in zip(axes @ cameras[:, :3, :3], intrinsics, pixels, strict=True)]
+    outlines = map(torch.from_numpy, pixels)
+    rays = [_rays(*each) for each in zip(axes @ cameras[:, :3, :3], intrinsics, outlines, strict=True)]
     places = cameras[:, :3, 3] @ axes.mT
     centre = _nearest_point(places, torch.stack([ray.mean(dim=0) for ray in rays]))
     for _ in range(3):  # the middle of a silhouette is that of a view towards the centre
@@ -289,9 +289,9 @@ def _about_up(angle: float) -> Tensor:
     return torch.tensor([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]], dtype=torch.float64)
 
 
-def _rays(rotation: Tensor, intrinsics: Tensor, pixels: NDArray[np.float64]) -> Tensor:
-    """Directions `[M, 3]` of pixels `[M, 2]`, in the frame of `rotation` `[3, 3]` (camera to world, OpenGL axes)."""
-    points = torch.from_numpy(np.concatenate([pixels, np.ones((len(pixels), 1))], axis=-1))
+def _rays(rotation: Tensor, intrinsics: Tensor, pixels: Tensor) -> Tensor:
+    """Directions `[..., M, 3]` of pixels `[..., M, 2]`, in the frame of `rotation` `[..., 3, 3]` (camera to world)."""
+    points = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
     seen = torch.linalg.solve(intrinsics, points.mT).mT * points.new_tensor([1.0, -1.0, -1.0])
     return seen @ rotation.mT
 

@@ -6,6 +6,8 @@ drawn wrong in silence.
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,10 +16,9 @@ import trimesh
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from lp_framework.data.images import eight_bit
-from lp_framework.data.mesh_files.common import FARTHEST, warn
+from lp_framework.data.mesh_files.common import FARTHEST, load, texture_bytes, warn
 from lp_framework.data.mesh_files.gltf import read_gltf
 from lp_framework.data.mesh_files.obj import read_obj
-from lp_framework.data.mesh_files.ply import read_ply
 from lp_framework.errors import UserError
 
 
@@ -43,6 +44,19 @@ def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     if left_out := sorted(set().union(*map(_left_out, meshes))):
         warn(path, f"not drawn of its materials: {', '.join(left_out)}")
     return scene
+
+
+def read_ply(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
+    """The scene of a .ply file, whose texture is looked for in `folders`."""
+    with path.open("rb") as file:
+        header = b"".join(itertools.takewhile(lambda line: not line.startswith(b"end_header"), file)).decode("utf-8")
+        names = list(dict.fromkeys(re.findall(r"^comment\s+TextureFile\s+(.*?)\s*$", header, re.MULTILINE | re.I)))
+        if len(names) > 1:
+            raise UserError(f"{path}: has {len(names)} textures, one is read; save it as glTF or OBJ")
+        textures = {name: texture_bytes(path, name, folders) for name in names}
+        files: dict[str, bytes | str] = {name: data for name, data in textures.items() if data is not None}
+        file.seek(0)
+        return load("ply", file, files, skip_materials=not files)
 
 
 def _mend(path: Path, mesh: trimesh.Trimesh) -> None:

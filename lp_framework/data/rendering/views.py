@@ -28,9 +28,8 @@ from PIL import Image
 from lp_framework.atomic import DiskFull, written
 from lp_framework.data.cache import tracked
 from lp_framework.data.camera_files import nerf_transforms, view_cameras
-from lp_framework.data.files import differences, locked, raise_failures, read_record, written_folder
+from lp_framework.data.files import Origin, differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.meshes import MeshObject, fingerprint
-from lp_framework.data.origins import Origin
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, write_transforms
 from lp_framework.errors import UserError, check_settings
@@ -138,32 +137,22 @@ def render_object(
     """Render an object into `<root>/<name>`, whole or not at all, unless it is there already; `files` is the record of
     its `Origin`. `UserError` when it does not load, when its folder holds something else, and when it cannot be
     written."""
-    folder = Path(root) / obj.name
-    scene = obj.load()
-    mesh, settings = fingerprint(scene), asdict(protocol)
-    of_files = {} if files is None else {"files": files}
+    folder, scene = Path(root) / obj.name, obj.load()
+    made_from = {"mesh": fingerprint(scene)} | ({} if files is None else {"files": files})
     if folder.exists():
         changes, record = _changes(folder, protocol), read_record(folder / RECORD)
-        if not changes and record.get("mesh") != mesh:
+        if not changes and record.get("mesh") != made_from["mesh"]:
             changes = "of another mesh, or by an earlier version's reading of it"
         if changes:  # told once where it is the same for several objects
-            raise UserError(
-                f"the views in {root} were rendered differently ({changes}); choose another folder of "
-                "views or delete them"
-            )
-        if files is not None:  # the same mesh in other files
+            advice = "choose another folder of views or delete them"
+            raise UserError(f"the views in {root} were rendered differently ({changes}); {advice}")
+        if record != record | made_from:  # the same mesh in other files
             with written(folder / RECORD) as partial:
-                partial.write_text(json.dumps(record | of_files, indent=1))
+                partial.write_text(json.dumps(record | made_from, indent=1))
         return
     labels = {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer}
-    record = {
-        "object": obj.name,
-        "mesh": mesh,
-        **of_files,
-        "renderer": renderer.name,
-        **labels,
-        "protocol": {key: value for key, value in settings.items() if key not in LATER or value != LATER[key]},
-    }
+    settings = {key: value for key, value in asdict(protocol).items() if key not in LATER or value != LATER[key]}
+    record = {"object": obj.name, **made_from, "renderer": renderer.name, **labels, "protocol": settings}
     protocol = protocol.of_object(obj.name)
     splits = {"train": protocol.training_poses(obj.name), "test": protocol.test_poses(obj.name)}
 
@@ -171,25 +160,22 @@ def render_object(
         cameras = camera_to_world(torch.from_numpy(np.concatenate(list(splits.values()))))
         views = renderer.views(scene, cameras, protocol.resolution, protocol.field_of_view_degrees)
         for split, poses in splits.items():
-            names = [f"{index:03d}.png" for index in range(len(poses))]
-            placed = torch.from_numpy(poses)
-            shown = view_cameras(names, placed, protocol.resolution, protocol.field_of_view_degrees)
-            transforms = nerf_transforms(shown, placed)
             for kind in ("rgb", "depth") if protocol.depth else ("rgb",):
                 (partial / split / kind).mkdir(parents=True)
+            names = [f"{index:03d}.png" for index in range(len(poses))]
             for name in names:
                 pixels, depth = next(views)
                 Image.fromarray(pixels).save(partial / split / "rgb" / name, compress_level=1)
                 if protocol.depth:
                     if depth is None:
-                        raise UserError(
-                            f"renderer={renderer.name} knows no depth; set data.depth=false or choose another"
-                        )
+                        raise UserError(f"renderer={renderer.name} knows no depth; set data.depth=false")
                     levels = np.rint(depth / DEPTH_UNIT).clip(0, 65535).astype(np.uint16)
                     Image.fromarray(levels).save(partial / split / "depth" / name, compress_level=1)
-            if obj.ambiguity != "unlabelled":
-                transforms |= labels
-            write_transforms(partial / split, **transforms)
+            placed = torch.from_numpy(poses)
+            transforms = nerf_transforms(
+                view_cameras(names, placed, protocol.resolution, protocol.field_of_view_degrees), placed
+            )
+            write_transforms(partial / split, **transforms, **({} if obj.ambiguity == "unlabelled" else labels))
         (partial / RECORD).write_text(json.dumps(record, indent=1))
 
 
@@ -201,13 +187,6 @@ def _changes(folder: Path, protocol: ViewProtocol) -> str:
         return f"it has no proper {RECORD}"
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
     return differences({**LATER, **record["protocol"]}, wanted)
-
-
-def _is_finished(folder: Path, protocol: ViewProtocol, origin: Origin | None) -> bool:
-    """Whether an object's views are there as wanted; `origin` is None where its files are not at hand."""
-    if _changes(folder, protocol):
-        return False
-    return origin is None or origin.is_of(read_record(folder / RECORD).get("files"))
 
 
 def render_objects(
@@ -233,11 +212,11 @@ def render_objects(
         return
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = min(workers, len(todo))
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
         work = partial(_work, root=root, protocol=protocol, renderer=renderer)
         files = [origins[obj.name].record() if obj.name in origins else None for obj in todo]
+        workers = min(workers, len(todo))
         done = _in_processes(work, todo, files, workers) if workers > 1 else map(work, todo, files)
         for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
             for message in messages:
@@ -245,6 +224,12 @@ def render_objects(
             if failure is not None:
                 failures[obj.name] = failure
     raise_failures(failures, len(todo), "rendered")
+
+
+def _is_finished(folder: Path, protocol: ViewProtocol, origin: Origin | None) -> bool:
+    """Whether an object's views are there as wanted; `origin` is None where its files are not at hand."""
+    sound = not _changes(folder, protocol)
+    return sound and (origin is None or origin.is_of(read_record(folder / RECORD).get("files")))
 
 
 Outcome = tuple[str | None, list[str]]  # the message of an object's `UserError`, those of its warnings

@@ -13,6 +13,7 @@ object, so its frame is taken from cameras, masks and point cloud (see `real_cam
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections import Counter
@@ -153,12 +154,9 @@ def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | Non
     with expecting(f"{file}: sequence '{sequence}' {wanted}"):
         cloud = found[0].get("point_cloud") or {}
         path = root / cloud["path"] if cloud and os.path.isfile(root / cloud["path"]) else None
-        both = {"viewpoint": found[0].get("viewpoint_quality_score"), "point_cloud": cloud.get("quality_score")}
-        scores = {
-            f"{of}_quality_score": float(score) if score is not None and math.isfinite(score) else None
-            for of, score in both.items()
-        }
-    return path, scores
+        scores = (found[0].get("viewpoint_quality_score"), cloud.get("quality_score"))
+        cameras, points = (float(score) if score is not None and math.isfinite(score) else None for score in scores)
+    return path, {"viewpoint_quality_score": cameras, "point_cloud_quality_score": points}
 
 
 def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: dict[str, float | None]) -> Annotated:
@@ -187,17 +185,17 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
             points = None  # of something else
     if points is None:
         sound = agreeing_views(cameras, intrinsics, pixels)
-    chosen = sound.nonzero()[:, 0].tolist()
-    if wrong := [each.file.name for index, each in enumerate(whole) if index not in chosen]:
+    if wrong := [photograph.file.name for photograph, fits in zip(whole, sound, strict=True) if not fits]:
         left_out[f"whose camera or mask does not fit the others' ({', '.join(wrong)})"] = len(wrong)
-    if len(chosen) < 3:
+    if sound.sum() < 3:
         return nothing
-    cameras = cameras[chosen]
+    cameras = cameras[sound]
     if points is None:
-        frame = frame_of_silhouettes(cameras, intrinsics[chosen], [pixels[index] for index in chosen])
+        frame = frame_of_silhouettes(cameras, intrinsics[sound], list(itertools.compress(pixels, sound)))
     else:
         frame = frame_of_points(cameras, points)
-    moved = [replace(whole[index], camera=camera) for index, camera in zip(chosen, frame.camera(cameras), strict=True)]
+    fitting = zip(itertools.compress(whole, sound), frame.camera(cameras), strict=True)
+    moved = [replace(photograph, camera=camera) for photograph, camera in fitting]
     source = "silhouettes" if points is None else "point cloud"
     return Annotated(moved, frame.corners(), left_out, {"object_frame": source, **scores})
 

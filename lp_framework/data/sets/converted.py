@@ -30,9 +30,8 @@ from torch import Tensor
 from lp_framework.atomic import DiskFull
 from lp_framework.data import real_cameras
 from lp_framework.data.cache import tracked
-from lp_framework.data.files import LIST, differences, locked, raise_failures, read_record, written_folder
+from lp_framework.data.files import LIST, Origin, differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.masks import HALF, mask_opacity
-from lp_framework.data.origins import Origin
 from lp_framework.data.photographs import read_image, read_mask
 from lp_framework.data.views import ViewSource, write_transforms
 from lp_framework.errors import UserError, check_settings

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -100,13 +100,11 @@ class HOPEv2Data(PhotographedData):
         return chosen(lists.seen, self.wanted, self.download)
 
     def annotations(self, name: str) -> list[Path]:
-        scenes = sorted({each.scene for each in self._instances.get(int(name.removeprefix("obj_")), [])})
+        scenes = sorted({each.scene for each in self._instances[_number(name)]})
         return [self.download / MODELS, *(scene / file for scene in scenes for file in ANNOTATIONS)]
 
     def photographs(self, name: str) -> Annotated:
-        number = int(name.removeprefix("obj_"))
-        frame = self._frames()[number]
-        instances = self._instances.get(number, [])
+        frame, instances = self._frames()[_number(name)], self._instances[_number(name)]
         visible = [each for each in instances if each.visible >= self.least_visible]
         hidden = Counter({"occluded": len(instances) - len(visible)})
         unit = _unit(visible, frame, f"{self.download}: object '{name}'")
@@ -123,36 +121,35 @@ class HOPEv2Data(PhotographedData):
         return frames
 
     @cached_property
-    def _instances(self) -> dict[int, list[Instance]]:
+    def _instances(self) -> defaultdict[int, list[Instance]]:
         """All annotated instances by object."""
         named = ((self.download / split, *sorted(self.download.glob(f"{split}_*"))) for split in self.splits)
         scenes = [file.parent for folder in chain(*named) for file in sorted(folder.glob("*/scene_gt.json"))]
         if not scenes:
             looked = ", ".join(f"{self.download}/{split}/*/scene_gt.json" for split in self.splits)
             raise UserError(f"{self.download}: has no annotated scenes; looked for {looked}")
-        found: dict[int, list[Instance]] = {}
+        found: defaultdict[int, list[Instance]] = defaultdict(list)
         for scene in scenes:
             contents = [read_json(scene / file) for file in ANNOTATIONS]
             wanted = "need cameras, and obj_id and visib_fract of the same instances"
             with expecting(f"{scene}: {', '.join(ANNOTATIONS)} {wanted}"):
-                cameras, poses, infos = (_by_number(content) for content in contents)
+                # Some pad the numbers of images with zeros.
+                cameras, poses, infos = ({int(image): entry for image, entry in each.items()} for each in contents)
                 for image, entries in poses.items():
                     for place, (pose, info) in enumerate(zip(entries, infos[image], strict=True)):
-                        found.setdefault(int(pose["obj_id"]), []).append(
-                            Instance(scene, image, place, float(info["visib_fract"]), pose, cameras.get(image))
-                        )
+                        instance = Instance(scene, image, place, float(info["visib_fract"]), pose, cameras.get(image))
+                        found[int(pose["obj_id"])].append(instance)
         return found
+
+
+def _number(name: str) -> int:
+    return int(name.removeprefix("obj_"))
 
 
 def _frame(info: dict[str, Any]) -> ObjectFrame:
     low, sides = (numbers([info[f"{key}_{axis}"] for axis in "xyz"], 3) for key in ("min", "size"))
     axes, longest = z_up_to_y_up(torch.eye(4, dtype=torch.float64))[:3, :3], sides.max()
     return ObjectFrame(axes, low + sides / 2, longest, axes @ sides / longest)
-
-
-def _by_number(content: Mapping[str, Any]) -> dict[int, Any]:
-    """Annotations by the number of their image, which some pad with zeros."""
-    return {int(image): entry for image, entry in content.items()}
 
 
 def _unit(instances: Sequence[Instance], frame: ObjectFrame, name: str) -> float:

@@ -19,10 +19,9 @@ import yaml
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from lp_framework.data.files import ObjectLists, chosen, drawn, expecting, kept_lists, listed, names_below
+from lp_framework.data.files import ObjectLists, Origin, chosen, drawn, expecting, kept_lists, listed, names_below
 from lp_framework.data.mesh_files.common import MissingColourWarning
 from lp_framework.data.meshes import MeshObject, load_scene
-from lp_framework.data.origins import Origin
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.rendering.views import ViewProtocol, render_objects
 from lp_framework.data.toy import toy_objects
