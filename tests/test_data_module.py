@@ -206,10 +206,10 @@ def test_a_view_shows_its_own_file(make, split):
     for view, file in enumerate(data.table.files):
         pixels = np.asarray(Image.open(file)).astype(int)
         expected = np.where(pixels[..., 3:] > 0, pixels[..., :3], 255)
-        np.testing.assert_array_equal(data.images[view], expected)
+        np.testing.assert_array_equal(data.images[data.rows[view]], expected)
     pairs = data.table.pairs("ordered")[-5:]
     batch = data[pairs]
-    assert torch.equal(batch.images[batch.query], as_images(torch.from_numpy(data.images[pairs[:, 1]])))
+    assert torch.equal(batch.images[batch.query], as_images(torch.from_numpy(data.images[data.rows[pairs[:, 1]]])))
 
 
 def test_features_are_computed_once_and_are_the_backbones(make):

@@ -15,7 +15,6 @@ from lp_framework.data.pairs import (
     PROTOCOLS,
     BlockSampler,
     PairData,
-    Rows,
     ViewTable,
     as_images,
     in_batches,
@@ -315,12 +314,12 @@ def test_features_take_the_place_of_images(data):
     np.testing.assert_array_equal(batch.features[batch.query], features[[12, 8]])
 
 
-def test_rows_of_a_larger_array_are_numbered_anew():
-    array, rows = np.arange(40).reshape(10, 4), np.array([7, 2, 5])
-    chosen = Rows(array, rows)
-    np.testing.assert_array_equal(chosen[1], array[2])
-    np.testing.assert_array_equal(chosen[np.array([2, 0])], array[[5, 7]])
-    np.testing.assert_array_equal(chosen[1:], array[[2, 5]])
+def test_views_may_be_some_rows_of_larger_arrays(data):
+    rows = np.random.default_rng(0).permutation(20)[: len(data.table)]
+    larger = np.zeros((20, *data.images.shape[1:]), np.uint8)
+    larger[rows] = data.images
+    pairs = np.array([[7, 12], [12, 8]])
+    assert torch.equal(PairData(data.table, larger, rows=rows)[pairs].images, data[pairs].images)
 
 
 def test_a_batch_does_not_write_into_the_cache(tmp_path, recwarn):

@@ -352,9 +352,8 @@ def test_steps_that_do_not_divide_the_range_stay_inside_it():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"resolution": 0}, {"field_of_view_degrees": 180}, {"lowest_latitude_degrees": 31}, {"test_views": -1},
-        {"highest_latitude_degrees": 91}, {"latitude_step_degrees": 0}, {"longitude_step_degrees": -15},
-        {"nearest_radius": 0}, {"farthest_radius": 1.0}, {"train_views": 0},
+        {"resolution": 0}, {"lowest_latitude_degrees": 31}, {"test_views": -1}, {"highest_latitude_degrees": 91},
+        {"latitude_step_degrees": 0}, {"longitude_step_degrees": -15}, {"train_views": 0},
     ],
 )  # fmt: skip
 def test_impossible_protocols_are_user_errors(wrong):

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader
 
 from lp_framework.data.cache import cached_array, decoded_views, tracked
 from lp_framework.data.files import content_key
-from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, Rows, ViewTable, as_images, in_batches, share_out
+from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, ViewTable, as_images, in_batches, share_out
 from lp_framework.data.photographic import decoded_renderings
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, ObjectViews, ViewSource
 from lp_framework.errors import UserError, check_settings
@@ -194,17 +194,13 @@ class PairDataModule(LightningDataModule):
             feature_key = content_key(
                 [], "features", Path(str(views.filename)).stem, extractor.fingerprint(), self._answer
             )
-            device = self._device()
+            device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
             arrays["features"] = cached_array(
                 self.cache, feature_key, len(files), lambda: _extracted(extractor, arrays["images"], device)
             )
         place = {file: row for row, file in enumerate(files)}
         rows = np.array([place[file] for file in table.files])
-        return PairData(table, **{name: Rows(array, rows) for name, array in arrays.items()}, crop=crop)
-
-    def _device(self) -> torch.device:
-        """Where the networks are going to be."""
-        return self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        return PairData(table, **arrays, rows=rows, crop=crop)
 
     def _ranks(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)

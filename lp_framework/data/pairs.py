@@ -132,42 +132,33 @@ class ViewTable:
         return np.concatenate(chosen)
 
 
-class Rows:
-    """Some rows of a memory-mapped array, numbered anew; read when they are asked for."""
-
-    def __init__(self, array: NDArray, rows: NDArray[np.int64]) -> None:
-        self.array, self.rows = array, rows
-
-    def __getitem__(self, index: int | slice | NDArray[np.int64]) -> NDArray:
-        return self.array[self.rows[index]]
-
-
 @dataclass(eq=False)
 class PairData(Dataset[PairBatch]):
     """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
 
     `images` (uint8), `features`, `points` and `cropped` (see `PairBatch`), where they are given, have a row for each
-    view of the table. With `crop` all images are crops to the object.
+    view of the table, or more, among which `rows` are the table's. With `crop` all images are crops to the object.
     """
 
     table: ViewTable
-    images: NDArray | Rows | None
-    features: NDArray | Rows | None = None
-    points: NDArray | Rows | None = None
-    cropped: NDArray | Rows | None = None
+    images: NDArray | None
+    features: NDArray | None = None
+    points: NDArray | None = None
+    cropped: NDArray | None = None
+    rows: NDArray[np.int64] | None = None
     crop: bool = False
 
     def __getitem__(self, pairs: NDArray[np.int64]) -> PairBatch:
         views, place = np.unique(pairs, return_inverse=True)
         place = place.reshape(pairs.shape)
-        index = torch.from_numpy(views)
+        index, rows = torch.from_numpy(views), views if self.rows is None else self.rows[views]
 
-        def rows(array: NDArray | Rows | None) -> Tensor | None:
-            return None if array is None else torch.from_numpy(array[views])
+        def stored(array: NDArray | None) -> Tensor | None:
+            return None if array is None else torch.from_numpy(array[rows])
 
         return PairBatch(
-            pixels=rows(self.images) if self.features is None else None,
-            features=rows(self.features),
+            pixels=stored(self.images) if self.features is None else None,
+            features=stored(self.features),
             names=[self.table.view_names[view] for view in views],
             poses=self.table.poses[index],
             cameras=self.table.cameras[index],
@@ -175,8 +166,8 @@ class PairData(Dataset[PairBatch]):
             reference=torch.from_numpy(place[:, 0]),
             query=torch.from_numpy(place[:, 1]),
             pairs=torch.from_numpy(pairs),
-            points=rows(self.points),
-            cropped=rows(self.cropped),
+            points=stored(self.points),
+            cropped=stored(self.cropped),
             field_of_view=None if self.crop else self.table.field_of_view[index],
         )
 

@@ -44,8 +44,10 @@ def like_photograph(
     size = (SIZE, SIZE)
     scene = scene.transform(size, Image.Transform.AFFINE, coefficients, Image.Resampling.BICUBIC, fillcolor=ground)
     alpha = alpha.transform(size, Image.Transform.AFFINE, coefficients, Image.Resampling.BICUBIC)
-    scene = _compressed(_lit(scene, random).filter(ImageFilter.GaussianBlur(random.uniform(0, 1.5))), random)
-    return np.dstack([np.asarray(scene), np.asarray(_masked(alpha, random))]), _warped(points, matrix)
+    scene = _lit(scene, random).filter(ImageFilter.GaussianBlur(random.uniform(0, 1.5)))
+    compressed = io.BytesIO()
+    scene.save(compressed, "JPEG", quality=int(random.integers(40, 96)))
+    return np.dstack([Image.open(compressed), _masked(alpha, random)]), _warped(points, matrix)
 
 
 def _to_crop(alpha: NDArray[np.uint8], roll: float, random: Generator) -> NDArray[np.float64]:
@@ -73,12 +75,6 @@ def _lit(image: Image.Image, random: Generator) -> Image.Image:
     gain = np.exp(random.normal(0, 0.25)) * np.exp(random.normal(0, 0.06, 3))
     levels = levels ** np.exp(random.normal(0, 0.2)) * gain * falloff[..., None]
     return Image.fromarray((levels.clip(0, 1) * 255 + 0.5).astype(np.uint8))
-
-
-def _compressed(image: Image.Image, random: Generator) -> Image.Image:
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=int(random.integers(40, 96)))
-    return Image.open(buffer)
 
 
 def _masked(alpha: Image.Image, random: Generator) -> Image.Image:

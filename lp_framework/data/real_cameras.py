@@ -2,15 +2,9 @@
 
 A photograph's camera is a camera-to-world matrix `[..., 4, 4]` (OpenGL axes, see `geometry.spherical`) in the object's
 frame (centre of its bounding box at the origin, +Y up, longest side 1), with intrinsics `[..., 3, 3]` in pixels, the
-corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). It stands anywhere, turned anyhow.
-
-1. *Virtual turn.* Turning a camera about its own centre changes the image by a homography, exactly. So the camera is
-   turned to look at the origin with +Y up: it is then spherical, at the latitude, longitude and distance of the real
-   one.
-2. *Crop.* The homography also chooses the field of view of the square crop. It is the one in which the object's centre
-   plane looks as large as it does to a camera of the priors' field of view F at the *effective radius* r:
-   tan(crop / 2) = r / distance * tan(F / 2). Any r could be had; `effective_radii` says which are taken.
-3. *Residual.* Seen from another distance, near parts look larger or smaller; `perspective_residual` says by how much.
+corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). docs/data.md says how it becomes spherical: a
+turn about its own centre and a crop, both by one homography, in which the object's centre plane looks as large as to a
+camera of the priors' field of view at the *effective radius*.
 
 Where there is no model of the object, up is the direction to which the cameras' right axes are closest to
 perpendicular: photographers hold cameras level. Its silhouettes or its point cloud tell its centre and longest side.

@@ -37,7 +37,7 @@ SUPPORTED = (
     # These say how light falls on a material, or where lamps are.
     "KHR_materials_", "KHR_lights_", "EXT_lights_",
 )  # fmt: skip
-COLOUR_TEXTURES = ("baseColorTexture", "diffuseTexture")
+COLOUR_TEXTURES, GLOSS_TEXTURE = ("baseColorTexture", "diffuseTexture"), "specularGlossinessTexture"
 COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 UNSIGNED_INT, FLOAT = 5125, 5126
@@ -134,13 +134,11 @@ class _File:
         """The index of a new accessor with the values `[count, components]`, unsigned integers or else floats."""
         kind = UNSIGNED_INT if values.dtype.kind == "u" else FLOAT
         data = np.ascontiguousarray(values, TYPES[kind]).tobytes()
+        view = {"buffer": len(self.buffers), "byteLength": len(data)}
         accessor = {"componentType": kind, "count": len(values), "type": [*COMPONENTS][values.shape[1] - 1]}
-        for key, item in (
-            ("buffers", {"byteLength": len(data)}),
-            ("bufferViews", {"buffer": len(self.buffers), "byteLength": len(data)}),
-            ("accessors", {"bufferView": len(self.header["bufferViews"]), **accessor}),
-        ):
-            self.header[key].append(item)
+        self.header["accessors"].append({"bufferView": len(self.header["bufferViews"]), **accessor})
+        self.header["bufferViews"].append(view)
+        self.header["buffers"].append({"byteLength": len(data)})
         self.buffers.append(data)
         return len(self.header["accessors"]) - 1
 
@@ -190,18 +188,13 @@ class _File:
     def instances(self) -> None:
         """A node of its own for each of the instances of a mesh (EXT_mesh_gpu_instancing)."""
         for node in [*self.header.get("nodes", [])]:
-            instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
-            if instancing is None:
-                continue
-            places = {
-                key.lower(): self._values(index).tolist()
-                for key, index in instancing["attributes"].items()
-                if key in ("TRANSLATION", "ROTATION", "SCALE")
-            }
-            mesh = node.pop("mesh")
-            for place in zip(*places.values(), strict=True):
-                node.setdefault("children", []).append(len(self.header["nodes"]))
-                self.header["nodes"].append({"mesh": mesh, **dict(zip(places, place, strict=True))})
+            if instancing := node.get("extensions", {}).get("EXT_mesh_gpu_instancing"):
+                mesh, attributes = node.pop("mesh"), instancing["attributes"]
+                keys = [key for key in ("TRANSLATION", "ROTATION", "SCALE") if key in attributes]
+                for place in zip(*(self._values(attributes[key]).tolist() for key in keys), strict=True):
+                    node.setdefault("children", []).append(len(self.header["nodes"]))
+                    moved = {key.lower(): values for key, values in zip(keys, place, strict=True)}
+                    self.header["nodes"].append({"mesh": mesh, **moved})
 
     def say_what_is_left_out(self) -> None:
         """Warn of what moves vertices and is not applied."""
@@ -219,13 +212,11 @@ class _File:
         for index, material in enumerate(self.header.get("materials", [])):
             colours = material.get("pbrMetallicRoughness", {})
             colours = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", colours)
+            # trimesh makes the colour of the older kind of material from both of its textures.
+            wanted |= {colours[key]["index"] for key in (*COLOUR_TEXTURES, GLOSS_TEXTURE) if key in colours}
             for key in COLOUR_TEXTURES:
                 if key in colours:
                     found[index] = colours[key]
-            # trimesh makes the colour of the older kind of material from both of its textures.
-            wanted |= {
-                colours[key]["index"] for key in (*COLOUR_TEXTURES, "specularGlossinessTexture") if key in colours
-            }
         for number in sorted(wanted):
             self._choose_source(self.header["textures"][number])
         return found
@@ -237,20 +228,17 @@ class _File:
             if (source := each.get("source")) is None:
                 continue
             image = self.header["images"][source]
-            if source not in self.images:
-                self.images[source] = self._image(image)
+            if source not in self.images and "bufferView" in image:
+                length = self.header["bufferViews"][image["bufferView"]]["byteLength"]
+                self.images[source] = self._view(image, np.dtype("u1"), length, 1).tobytes()
+            elif source not in self.images:
+                self.images[source] = self._named(image["uri"])
             if readable_image(self.images[source]):
                 texture["source"] = source
                 return
             uri = image.get("uri", "data:")
             named.append(image.get("mimeType", f"number {source}") if uri.startswith("data:") else uri)
         warn_of_texture(self.path, " or ".join(named) or "without an image")
-
-    def _image(self, image: dict[str, Any]) -> bytes | None:
-        if "bufferView" in image:
-            view = self.header["bufferViews"][image["bufferView"]]
-            return self._view(image, np.dtype("u1"), view["byteLength"], 1).tobytes()
-        return self._named(image["uri"])
 
     def wrap(self, texture: dict[str, Any] | None) -> tuple[int, int]:
         """How a texture goes on beyond its sides, across and up."""

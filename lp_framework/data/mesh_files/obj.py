@@ -79,10 +79,9 @@ def _libraries(path: Path, text: str, folders: Sequence[Path]) -> list[Path | No
     """The material files that a text names; None, after a warning, for one that is not there."""
     found = []
     for names in re.findall(r"^mtllib[ \t]+(.*?)[ \t]*$", text, re.MULTILINE):
-        one = find(names, folders)  # one name with spaces, or several names
-        for name, file in [(names, one)] if one else [(name, find(name, folders)) for name in names.split()]:
-            found.append(file)
-            if file is None:
+        for name in [names] if find(names, folders) else names.split():  # one name with spaces, or several names
+            found.append(find(name, folders))
+            if found[-1] is None:
                 warn(path, f"its material file {name} is not there", MissingColourWarning)
     return found
 
@@ -132,15 +131,13 @@ def _counting_forwards(text: str) -> str:
     counts = {"v": 0, "vt": 0, "vn": 0}
     lines = []
     for line in text.splitlines():
-        kind, *words = line.split() or [""]
+        kind, *corners = line.split() or [""]
         if kind in counts:
             counts[kind] += 1
         elif kind == "f":
-            corners = [zip(word.split("/"), counts.values(), strict=False) for word in words]
-            forwards = (
-                "/".join(str(int(index) + 1 + count) if index.startswith("-") else index for index, count in corner)
-                for corner in corners
-            )
-            line = " ".join(("f", *forwards))
+            for place, corner in enumerate(corners):
+                pairs = zip(corner.split("/"), counts.values(), strict=False)
+                corners[place] = "/".join(str(int(i) + 1 + count) if i.startswith("-") else i for i, count in pairs)
+            line = " ".join(("f", *corners))
         lines.append(line)
     return "\n".join(lines)

@@ -67,7 +67,6 @@ class ViewProtocol:
 
     def __post_init__(self) -> None:
         low, high = self.lowest_latitude_degrees, self.highest_latitude_degrees
-        near, far, angle = self.nearest_radius, self.farthest_radius, self.field_of_view_degrees
         steps = {key: getattr(self, key) for key in ("latitude_step_degrees", "longitude_step_degrees")}
         few, fields = self.train_views, self.field_of_view_range
         check_settings(
@@ -76,11 +75,9 @@ class ViewProtocol:
             ("test_views", self.test_views, self.test_views >= 0, "at least 0"),
             ("train_views", few, few is None or few >= 1, "at least 1, or null for the grid"),
             *((key, step, step > 0, "positive") for key, step in steps.items()),
-            ("field_of_view_degrees", angle, 0 < angle < 180, "between 0 and 180"),
             ("field_of_view_range", fields, fields is None or (len(fields) == 2 and 0 < fields[0] <= fields[1] < 180),
              "two angles between 0 and 180 degrees in ascending order, or null"),
             ("lowest_latitude_degrees", low, -90 <= low <= high <= 90, f"from -90 to the highest, {high}"),
-            ("nearest_radius", near, 0 < near <= far, f"from 0 to the farthest, {far}"),
         )  # fmt: skip
 
     def of_object(self, name: str) -> ViewProtocol:

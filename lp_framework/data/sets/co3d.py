@@ -204,10 +204,9 @@ def read_points(file: Path) -> Tensor:
     """The points `[P, 3]` (float64) of a PLY file; `UserError` naming it where it does not load or has fewer than 3."""
     with expecting(f"{file}: does not load as a point cloud of three or more points"):
         loaded: Any = trimesh.load(file, process=False)
-        points = numbers(np.asarray(loaded.vertices), len(loaded.vertices), 3)
-        if len(points) < 3:
-            raise ValueError(f"it has {len(points)}")
-    return points
+        if len(loaded.vertices) < 3:
+            raise ValueError(f"it has {len(loaded.vertices)}")
+        return numbers(np.asarray(loaded.vertices), len(loaded.vertices), 3)
 
 
 def mask_pixels(photograph: Photograph) -> NDArray[np.float64]:

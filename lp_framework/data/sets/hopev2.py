@@ -113,9 +113,12 @@ class HOPEv2Data(PhotographedData):
 
     def _frames(self) -> dict[int, ObjectFrame]:
         """The objects' frames in those of their models, by number; in their unit."""
-        file = self.download / MODELS
+        file, axes = self.download / MODELS, z_up_to_y_up(torch.eye(4, dtype=torch.float64))[:3, :3]
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
-            frames = {int(number): _frame(info) for number, info in read_json(file).items()}
+            frames = {}
+            for number, info in read_json(file).items():
+                low, sides = (numbers([info[f"{key}_{axis}"] for axis in "xyz"], 3) for key in ("min", "size"))
+                frames[int(number)] = ObjectFrame(axes, low + sides / 2, sides.max(), axes @ sides / sides.max())
         if not frames or not all(frame.longest_side > 0 for frame in frames.values()):
             raise UserError(f"{file}: has no objects with an extent")
         return frames
@@ -144,12 +147,6 @@ class HOPEv2Data(PhotographedData):
 
 def _number(name: str) -> int:
     return int(name.removeprefix("obj_"))
-
-
-def _frame(info: dict[str, Any]) -> ObjectFrame:
-    low, sides = (numbers([info[f"{key}_{axis}"] for axis in "xyz"], 3) for key in ("min", "size"))
-    axes, longest = z_up_to_y_up(torch.eye(4, dtype=torch.float64))[:3, :3], sides.max()
-    return ObjectFrame(axes, low + sides / 2, longest, axes @ sides / longest)
 
 
 def _unit(instances: Sequence[Instance], frame: ObjectFrame, name: str) -> float:

@@ -20,8 +20,6 @@ from trimesh.visual.material import PBRMaterial
 
 from lp_framework.data.meshes import MeshObject
 
-__all__ = ["toy_objects"]
-
 
 def toy_objects() -> list[MeshObject]:
     """The embedded objects, each with its ambiguity class."""
