@@ -13,9 +13,7 @@ import os
 import threading
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch.utils.data import DataLoader
 
 from lp_framework.atomic import DiskFull, written
 from lp_framework.data.cache import tracked
@@ -209,17 +208,31 @@ def render_objects(
         return
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = min(workers, len(todo))
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
-        work = partial(_work, root=root, protocol=protocol, renderer=renderer)
-        files = [origins[obj.name].record() if obj.name in origins else None for obj in todo]
-        workers = min(workers, len(todo))
-        done = _in_processes(work, todo, files, workers) if workers > 1 else map(work, todo, files)
-        for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
-            for message in messages:
-                warnings.warn(message, stacklevel=2)
-            if failure is not None:
-                failures[obj.name] = failure
+        jobs = [(obj, origins[obj.name].record() if obj.name in origins else None) for obj in todo]
+        done = DataLoader(
+            jobs,  # type: ignore[arg-type]  # a list will do
+            batch_size=None,
+            collate_fn=partial(_work, root=root, protocol=protocol, renderer=renderer),
+            num_workers=workers if workers > 1 else 0,
+            multiprocessing_context="spawn" if workers > 1 else None,  # an OpenGL context does not survive a fork
+            worker_init_fn=_begin_worker,
+        )
+        try:
+            for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
+                for message in messages:
+                    warnings.warn(message, stacklevel=2)
+                if isinstance(failure, DiskFull):
+                    raise failure
+                if failure is not None:
+                    failures[obj.name] = str(failure)
+        except RuntimeError as error:
+            if not str(error).startswith("DataLoader worker"):
+                raise
+            what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
+            raise UserError(f"{what}, run the same command again with fewer workers") from error
     raise_failures(failures, len(todo), "rendered")
 
 
@@ -229,38 +242,22 @@ def _is_finished(folder: Path, protocol: ViewProtocol, origin: Origin | None) ->
     return sound and (origin is None or origin.is_of(read_record(folder / RECORD).get("files")))
 
 
-Outcome = tuple[str | None, list[str]]  # the message of an object's `UserError`, those of its warnings
-
-
 def _work(
-    obj: MeshObject, files: Mapping[str, str] | None, root: str | Path, protocol: ViewProtocol, renderer: Renderer
-) -> Outcome:
+    job: tuple[MeshObject, dict[str, str] | None], root: str | Path, protocol: ViewProtocol, renderer: Renderer
+) -> tuple[UserError | None, list[str]]:
+    """Render one object: its `UserError`, and its warnings."""
     failure = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            render_object(obj, root, protocol, renderer, files)
-        except DiskFull:
-            raise
+            render_object(job[0], root, protocol, renderer, job[1])
         except UserError as error:
-            failure = str(error)
+            failure = error
     # Others than those for users, such as NumPy's of a division by zero, tell them nothing.
     return failure, [" ".join(str(each.message).split()) for each in caught if issubclass(each.category, UserWarning)]
 
 
-def _in_processes(
-    work: Callable[..., Outcome], objects: list[MeshObject], files: list[dict[str, str] | None], workers: int
-) -> Iterator[Outcome]:
-    context = multiprocessing.get_context("spawn")  # an OpenGL context does not survive a fork
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as executor:
-        try:
-            yield from executor.map(work, objects, files)
-        except BrokenProcessPool as error:
-            what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
-            raise UserError(f"{what}, run the same command again with fewer workers") from error
-
-
-def _start_worker() -> None:
+def _begin_worker(_: int) -> None:
     # The workers fill the cores already; more threads in Mesa's software OpenGL would only get in each other's way.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     threading.Thread(target=_end_with_parent, daemon=True).start()
