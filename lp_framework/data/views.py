@@ -90,8 +90,9 @@ def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -
     """The field of view (radians) of a frame, by its own intrinsics or else by those of its file; raises anything."""
     every = {**content, **frame}
     own = frame if {"camera_angle_x", "fl_x"} & frame.keys() else content
-    angle = float(own["camera_angle_x"]) if "camera_angle_x" in own or "fl_x" not in own else None
-    if "fl_x" in own:
+    if "fl_x" not in own:
+        angle = float(own["camera_angle_x"])
+    else:
         focal, width = float(own["fl_x"]), float(every["w"])
         height = float(every.get("h", width))
         stretched = float(own.get("fl_y", focal)) / focal - 1
@@ -99,11 +100,11 @@ def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -
         if not all(abs(each) <= LARGEST_OFFSET for each in (stretched, *aside)):
             wanted = "fl_x and fl_y must be equal, and cx and cy the image's middle"
             raise UserError(f"{path}: the views' pixels must be square and their cameras centred: {wanted}")
-        by_focal = 2 * math.atan(width / 2 / focal)
-        if angle is not None and not abs(angle - by_focal) <= LARGEST_OFFSET:
-            raise UserError(f"{path}: camera_angle_x is {angle:.4g}, but fl_x and w say {by_focal:.4g} radians")
-        angle = by_focal
-    if angle is None or not 0 < angle < math.pi:
+        angle = 2 * math.atan(width / 2 / focal)
+        told = float(own.get("camera_angle_x", angle))
+        if not abs(told - angle) <= LARGEST_OFFSET:
+            raise UserError(f"{path}: camera_angle_x is {told:.4g}, but fl_x and w say {angle:.4g} radians")
+    if not 0 < angle < math.pi:
         raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {angle}")
     return angle
 

@@ -134,16 +134,11 @@ def _forget_opengl() -> None:
 class AutoRenderer(Renderer):
     """pyrender where there is OpenGL, else raycast with a warning that says why."""
 
-    def __init__(self) -> None:
-        self.chosen: Renderer = PyrenderRenderer()
+    def __new__(cls) -> Renderer:  # type: ignore[misc]  # one of the two
+        """A renderer by either."""
         try:
             offscreen_context()
         except UserError as error:
             warnings.warn(f"rendering with raycast instead of pyrender: {error}", stacklevel=2)
-            self.chosen = RaycastRenderer()
-        self.name = self.chosen.name
-
-    def views(
-        self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
-    ) -> Iterator[View]:
-        return self.chosen.views(scene, camera_to_world, resolution, field_of_view_degrees)
+            return RaycastRenderer()
+        return PyrenderRenderer()

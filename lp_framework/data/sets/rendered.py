@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal
 import trimesh
 import yaml
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from lp_framework.data.files import ObjectLists, Origin, chosen, drawn, expecting, kept_lists, listed, names_below
 from lp_framework.data.mesh_files.common import MissingColourWarning
@@ -54,16 +54,17 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
         content = yaml.load(path.read_text(encoding="utf-8"), yaml.BaseLoader)
     if not isinstance(content, dict):
         raise UserError(f"{path}: must give every object its label, as in 'mug: {{ambiguity: unique}}'")
-    labels = {}
-    for name, label in content.items():
+    for name in content:
         if name not in names:
             raise UserError(f"{path}: {where} has no object '{name}'{nearest(name, names)}")
-        try:
-            labels[name] = Label.model_validate(label)
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = "".join(f"{each}: " for each in first["loc"])
-            raise UserError(f"{path}: object '{name}': {key}{first['msg']}, got {first['input']!r}") from error
+    try:
+        labels = TypeAdapter(dict[str, Label]).validate_python(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name, *keys = (str(each) for each in first["loc"])
+        raise UserError(
+            f"{path}: object '{name}': {': '.join([*keys, first['msg']])}, got {first['input']!r}"
+        ) from error
     if left_out := sorted(set(names) - set(labels)):
         warnings.warn(f"{path}: leaves out, so that they stay unlabelled: {listed(left_out)}", stacklevel=2)
     return labels
