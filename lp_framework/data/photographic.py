@@ -47,7 +47,8 @@ def like_photograph(
     scene = _lit(scene, random).filter(ImageFilter.GaussianBlur(random.uniform(0, 1.5)))
     compressed = io.BytesIO()
     scene.save(compressed, "JPEG", quality=int(random.integers(40, 96)))
-    return np.dstack([Image.open(compressed), _masked(alpha, random)]), _warped(points, matrix)
+    rgba = np.dstack([np.asarray(Image.open(compressed)), np.asarray(_masked(alpha, random))])
+    return rgba, _warped(points, matrix)
 
 
 def _to_crop(alpha: NDArray[np.uint8], roll: float, random: Generator) -> NDArray[np.float64]:
@@ -134,7 +135,8 @@ def decoded_renderings(
 
     seen_from = [(each.name, each.cameras.tolist(), each.field_of_view.tolist()) for each in views]
     key = content_key([*files, *depths], "renderings by object", share, size, CELLS, seen_from)
-    answers = [decode(*sample_images(), np.eye(4), 1.0, each) for each in (None, np.random.default_rng(0))]
+    soft, deep = sample_images()
+    answers = [decode(soft, deep, np.eye(4), 1.0, each) for each in (None, np.random.default_rng(0))]
     return key, cached_array(folder, answered_key(key, answers), len(files), blocks)
 
 

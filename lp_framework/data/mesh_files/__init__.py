@@ -6,7 +6,7 @@ drawn wrong in silence.
 
 from __future__ import annotations
 
-import itertools
+import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,15 +48,14 @@ def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
 
 def read_ply(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     """The scene of a .ply file, whose texture is looked for in `folders`."""
-    with path.open("rb") as file:
-        header = b"".join(itertools.takewhile(lambda line: not line.startswith(b"end_header"), file)).decode("utf-8")
-        names = list(dict.fromkeys(re.findall(r"^comment\s+TextureFile\s+(.*?)\s*$", header, re.MULTILINE | re.I)))
-        if len(names) > 1:
-            raise UserError(f"{path}: has {len(names)} textures, one is read; save it as glTF or OBJ")
-        textures = {name: texture_bytes(path, name, folders) for name in names}
-        files: dict[str, bytes | str] = {name: data for name, data in textures.items() if data is not None}
-        file.seek(0)
-        return load("ply", file, files, skip_materials=not files)
+    content = path.read_bytes()
+    header = content.partition(b"\nend_header")[0].decode("utf-8")
+    names = list(dict.fromkeys(re.findall(r"^comment\s+TextureFile\s+(.*?)\s*$", header, re.MULTILINE | re.I)))
+    if len(names) > 1:
+        raise UserError(f"{path}: has {len(names)} textures, one is read; save it as glTF or OBJ")
+    textures = {name: texture_bytes(path, name, folders) for name in names}
+    files: dict[str, bytes | str] = {name: data for name, data in textures.items() if data is not None}
+    return load("ply", io.BytesIO(content), files, skip_materials=not files)
 
 
 def _mend(path: Path, mesh: trimesh.Trimesh) -> None:

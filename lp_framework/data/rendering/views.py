@@ -168,10 +168,11 @@ def render_object(
                     levels = np.rint(depth / DEPTH_UNIT).clip(0, 65535).astype(np.uint16)
                     Image.fromarray(levels).save(partial / split / "depth" / name, compress_level=1)
             placed = torch.from_numpy(poses)
-            transforms = nerf_transforms(
-                view_cameras(names, placed, protocol.resolution, protocol.field_of_view_degrees), placed
-            )
-            write_transforms(partial / split, **transforms, **({} if obj.ambiguity == "unlabelled" else labels))
+            shown = view_cameras(names, placed, protocol.resolution, protocol.field_of_view_degrees)
+            transforms = nerf_transforms(shown, placed)
+            if obj.ambiguity != "unlabelled":
+                transforms |= labels
+            write_transforms(partial / split, **transforms)
         (partial / RECORD).write_text(json.dumps(record, indent=1))
 
 
@@ -212,7 +213,7 @@ def render_objects(
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
         jobs = [(obj, origins[obj.name].record() if obj.name in origins else None) for obj in todo]
-        done = DataLoader(
+        done: DataLoader[tuple[UserError | None, list[str]]] = DataLoader(
             jobs,  # type: ignore[arg-type]  # a list will do
             batch_size=None,
             collate_fn=partial(_work, root=root, protocol=protocol, renderer=renderer),

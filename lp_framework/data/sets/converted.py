@@ -207,8 +207,8 @@ class PhotographedData(ConvertedSource):
                 crop(views[index], self.resolution).save(folder / split / "rgb" / file, compress_level=1)
                 frames.append(self._frame(file, views[index]))
             write_transforms(folder / split, frames)
-        photographs, _, turns, residuals = zip(*(views[index] for index in chosen), strict=True)
-        files = [file for photograph in photographs for file in (photograph.file, photograph.mask)]
+        taken, _, turns, residuals = zip(*(views[index] for index in chosen), strict=True)
+        files = [file for photograph in taken for file in (photograph.file, photograph.mask)]
         return [*self.annotations(name), *files], {
             **remarks,
             "left_out": dict(left_out),
