@@ -51,14 +51,10 @@ class Instance(NamedTuple):
 
     scene: Path
     image: int
-    place: int  # among the instances of the image
+    mask: Path
     visible: float  # share of the silhouette
     pose: Any
     camera: Any
-
-    @property
-    def mask(self) -> Path:
-        return self.scene / "mask_visib" / f"{self.image:06d}_{self.place:06d}.png"
 
     def numbers(self) -> tuple[Tensor, Tensor, Tensor]:
         """Rotation `[3, 3]` and translation `[3]`, from the model to the camera, and intrinsics `[3, 3]`."""
@@ -140,7 +136,10 @@ class HOPEv2Data(PhotographedData):
                 cameras, poses, infos = ({int(image): entry for image, entry in each.items()} for each in contents)
                 for image, entries in poses.items():
                     for place, (pose, info) in enumerate(zip(entries, infos[image], strict=True)):
-                        instance = Instance(scene, image, place, float(info["visib_fract"]), pose, cameras.get(image))
+                        mask, visible = f"{image:06d}_{place:06d}.png", float(info["visib_fract"])
+                        instance = Instance(
+                            scene, image, scene / "mask_visib" / mask, visible, pose, cameras.get(image)
+                        )
                         found[int(pose["obj_id"])].append(instance)
         return found
 

@@ -166,7 +166,7 @@ class MeshData(RenderedData):
         workers: int | None = None,
     ) -> None:
         self.meshes, self.labels = Path(path), None if labels is None else Path(labels)
-        self.up, self.unseen, self.which, self.split_seed = up, unseen, objects, split_seed
+        self.up, self.unseen, self.wanted, self.split_seed = up, unseen, objects, split_seed
         super().__init__(
             renderer, views or f"datasets/{self.meshes.resolve().name}", workers, resolution=resolution,
             test_views=test_views, train_views=train_views, latitude_step_degrees=latitude_step_degrees,
@@ -175,17 +175,17 @@ class MeshData(RenderedData):
 
     def objects(self) -> list[MeshObject]:
         """The objects in use, sorted by name; of the seen and unseen ones see `kept_lists`."""
-        if self.which not in ("seen", "unseen"):
-            names = chosen([*self.files, "seen", "unseen"], self.which, self.meshes)
+        if self.wanted not in ("seen", "unseen"):
+            names = chosen([*self.files, "seen", "unseen"], self.wanted, self.meshes)
             return [self._object(name) for name in names]
-        if self.seen is None and not self.unseen and self.which == "seen":
+        if self.seen is None and not self.unseen and self.wanted == "seen":
             return [self._object(name) for name in self.files]
         how = {key: getattr(self, key) for key in ("seen", "unseen", "split_seed")}
         how["renderings"] = None if self.renderings is None else self.renderings.name
         lists = kept_lists(self.path, how, self._choose)
-        names = lists.unseen if self.which == "unseen" else lists.seen
+        names = lists.unseen if self.wanted == "unseen" else lists.seen
         if not names:
-            raise UserError(f"data.objects={self.which}: there are none; set data.unseen to their number")
+            raise UserError(f"data.objects={self.wanted}: there are none; set data.unseen to their number")
         return [self._object(name) for name in names]
 
     def _choose(self) -> ObjectLists:
