@@ -390,6 +390,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+def test_rendering_leaves_random_numbers_alone(tmp_path):
+    before = torch.get_rng_state()
+    render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_written_views_have_ifusions_layout(tmp_path):
     protocol = ViewProtocol(resolution=32, latitude_step_degrees=30, longitude_step_degrees=120, test_views=2)
     render_object(*objects_named("cube"), tmp_path, protocol, RaycastRenderer())

@@ -220,6 +220,7 @@ def render_objects(
             num_workers=workers if workers > 1 else 0,
             multiprocessing_context="spawn" if workers > 1 else None,  # an OpenGL context does not survive a fork
             worker_init_fn=_begin_worker,
+            generator=torch.Generator(),  # or a training that renders first would go on with other random numbers
         )
         try:
             for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
