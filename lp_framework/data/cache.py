@@ -96,24 +96,18 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
     decoded once by a version of this program. With `crop` the object is centred and scaled as that of a photograph, by
     the alpha channel (see `prepare`).
 
-    `UserError` for an image that does not decode, is not square, or differs in size from the others of its folder."""
+    `UserError` for an image that does not decode or is not square."""
 
     def decode(image: Image.Image) -> NDArray[np.uint8]:
         called = str(getattr(image, "filename", "a view"))
         return pixels_on_white(prepare(eight_bit(image).convert("RGBA"), called) if crop else image, size)
 
     def blocks() -> Iterator[NDArray[np.uint8]]:
-        sizes: dict[Path, tuple[int, int]] = {}
         for file in tracked(files, "decoding views"):
             with opened(file) as image:
-                told = f"{file}: is {image.width} x {image.height} pixels"
                 if image.width != image.height:
-                    raise UserError(f"{told}; views must be square")
-                width, height = sizes.setdefault(file.parent, image.size)
-                if image.size != (width, height):
-                    raise UserError(f"{told}, the other images of its folder are {width} x {height}")
-                block = decode(image)[None]
-            yield block
+                    raise UserError(f"{file}: is {image.width} x {image.height} pixels; views must be square")
+                yield decode(image)[None]
 
     key = content_key(files, "crops" if crop else "views", size)
     answers = [decode(sample) for sample in sample_images()[: 1 if crop else 2]]
