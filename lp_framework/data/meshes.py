@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-from lp_framework.data.files import expecting
+from lp_framework.data.files import Origin, expecting
 from lp_framework.data.images import eight_bit
 from lp_framework.data.mesh_files import read_mesh
 from lp_framework.data.mesh_files.common import (
@@ -49,13 +49,15 @@ class MeshObject:
 
     `load` travels to worker processes: a module-level function or a `functools.partial` of one. `unique_answer` says
     whether a view has one right longitude: shapes without symmetry and two-fold ones, whose texture tells, have (the
-    default), bodies of revolution only with a texture that tells; None where nobody has looked.
+    default), bodies of revolution only with a texture that tells; None where nobody has looked. `origin` has the files
+    that it is made from, where they are at hand.
     """
 
     name: str
     ambiguity: Ambiguity
     load: Callable[[], trimesh.Scene]
     unique_answer: bool | None = None
+    origin: Origin | None = None
 
     def __post_init__(self) -> None:
         if self.unique_answer is None and self.ambiguity != "unlabelled":

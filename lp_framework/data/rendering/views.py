@@ -27,7 +27,7 @@ from torch.utils.data import DataLoader
 from lp_framework.atomic import DiskFull, written
 from lp_framework.data.cache import tracked
 from lp_framework.data.camera_files import nerf_transforms, view_cameras
-from lp_framework.data.files import Origin, differences, locked, raise_failures, read_record, written_folder
+from lp_framework.data.files import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.meshes import MeshObject, fingerprint
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.views import DEPTH_UNIT, FIELD_OF_VIEW_DEGREES, write_transforms
@@ -193,18 +193,14 @@ def render_objects(
     renderer: Renderer,
     workers: int | None = None,
     check_meshes: bool = True,
-    origins: Mapping[str, Origin] | None = None,
 ) -> None:
     """Render objects into `<root>/<name>`, in `workers` processes (None: one a CPU core); finished ones are skipped.
 
     `check_meshes` loads the meshes of finished ones too, to see that the views were made from them; without it those
-    are loaded whose files, by name in `origins`, are not those that the views were made from. Two runs into one folder
-    take turns. A `UserError` of one object does not stop the others, unless the disk is full; one at the end lists them
-    all.
+    are loaded whose files are not those that the views were made from. Two runs into one folder take turns. A
+    `UserError` of one object does not stop the others, unless the disk is full; one at the end lists them all.
     """
-    todo, origins = list(objects), origins or {}
-    if not check_meshes:
-        todo = [obj for obj in todo if not _is_finished(Path(root) / obj.name, protocol, origins.get(obj.name))]
+    todo = [obj for obj in objects if check_meshes or not _is_finished(obj, Path(root) / obj.name, protocol)]
     if not todo:
         return
     if workers is None:
@@ -212,7 +208,7 @@ def render_objects(
     workers = min(workers, len(todo))
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
-        jobs = [(obj, origins[obj.name].record() if obj.name in origins else None) for obj in todo]
+        jobs = [(obj, obj.origin and obj.origin.record()) for obj in todo]
         done: DataLoader[tuple[UserError | None, list[str]]] = DataLoader(
             jobs,  # type: ignore[arg-type]  # a list will do
             batch_size=None,
@@ -238,10 +234,10 @@ def render_objects(
     raise_failures(failures, len(todo), "rendered")
 
 
-def _is_finished(folder: Path, protocol: ViewProtocol, origin: Origin | None) -> bool:
-    """Whether an object's views are there as wanted; `origin` is None where its files are not at hand."""
+def _is_finished(obj: MeshObject, folder: Path, protocol: ViewProtocol) -> bool:
+    """Whether an object's views are there as wanted, and of its files where these are at hand."""
     sound = not _changes(folder, protocol)
-    return sound and (origin is None or origin.is_of(read_record(folder / RECORD).get("files")))
+    return sound and (obj.origin is None or obj.origin.is_of(read_record(folder / RECORD).get("files")))
 
 
 def _work(

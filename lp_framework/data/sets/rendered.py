@@ -40,6 +40,9 @@ class Label(BaseModel):
     reason: str | None = None
 
 
+UNLABELLED = Label.model_construct(ambiguity="unlabelled")  # which no file may say
+
+
 def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, Label]:
     """The labels in a YAML file, by object; `names` are the objects in the folder `where`.
 
@@ -88,12 +91,7 @@ class RenderedData(ViewSource):
 
     def prepare(self, check_meshes: bool = False) -> None:
         """Render what is missing; the others must be of the files at hand, or with `check_meshes` of what they hold."""
-        objects, origins = self.objects(), self.origins()
-        render_objects(objects, self.path, self.protocol, self.renderer, self.workers, check_meshes, origins)
-
-    def origins(self) -> dict[str, Origin]:
-        """The files of each object, as far as they are at hand; none for objects that this package makes."""
-        return {}
+        render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers, check_meshes)
 
     def views(self, name: str, split: str) -> ObjectViews:
         """The views, with the label of the object, whatever they were rendered with; theirs where nothing labels it."""
@@ -203,10 +201,13 @@ class MeshData(RenderedData):
         """What loads a mesh."""
         return partial(load_scene, file, self.up)
 
-    def origins(self) -> dict[str, Origin]:
-        """The mesh of each object, beside the materials, buffers and images that any of them may refer to."""
-        beside = Origin(self._parts(self.meshes))
-        return {name: Origin([self.files[name]], beside, self.up) for name in self.names() if name in self.files}
+    def origin(self, file: Path) -> Origin:
+        """A mesh, beside the materials, buffers and images that any in the folder may refer to."""
+        return Origin([file], self._beside, self.up)
+
+    @cached_property
+    def _beside(self) -> Origin:
+        return Origin(self._parts(self.meshes))
 
     def _parts(self, folder: Path) -> list[Path]:
         """The files below a folder that meshes refer to."""
@@ -215,10 +216,9 @@ class MeshData(RenderedData):
         return sorted(file for file in found if not file.is_relative_to(views) and file.name[0] != ".")
 
     def _object(self, name: str) -> MeshObject:
-        load, label = self.loader(self.files.get(name, self.meshes / name)), self._labels.get(name)
-        if label is None:
-            return MeshObject(name, "unlabelled", load)
-        return MeshObject(name, label.ambiguity, load, label.unique_answer)
+        file, label = self.files.get(name, self.meshes / name), self._labels.get(name, UNLABELLED)
+        origin = self.origin(file) if file.is_file() else None
+        return MeshObject(name, label.ambiguity, self.loader(file), label.unique_answer, origin)
 
     @cached_property
     def files(self) -> dict[str, Path]:
@@ -277,10 +277,9 @@ class ScannedData(MeshData):
         found = {file.parts[-3]: file for file in self.meshes.glob(self.layout)}
         return {name: found[name] for name in names_below(self.meshes, found, self.what, self.meshes / self.layout)}
 
-    def origins(self) -> dict[str, Origin]:
-        """The mesh of each object and what lies in its folder."""
-        files = {name: self.files[name] for name in self.names() if name in self.files}
-        return {name: Origin([file, *self._parts(file.parents[1])]) for name, file in files.items()}
+    def origin(self, file: Path) -> Origin:
+        """A mesh and what lies in the folder of its object."""
+        return Origin([file, *self._parts(file.parents[1])])
 
 
 def load_scan(path: Path, up: Literal["y", "z"]) -> trimesh.Scene:
