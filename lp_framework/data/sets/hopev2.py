@@ -92,42 +92,42 @@ class HOPEv2Data(PhotographedData):
 
     def names(self) -> list[str]:
         """The objects that have a model, `obj_000001` and so on, as far as they are chosen."""
-        lists = kept_lists(self.path, {}, lambda: ObjectLists([f"obj_{n:06d}" for n in sorted(self._frames())], []))
+        lists = kept_lists(self.path, {}, lambda: ObjectLists(sorted(self._frames()), []))
         return chosen(lists.seen, self.wanted, self.download)
 
     def annotations(self, name: str) -> list[Path]:
-        scenes = sorted({each.scene for each in self._instances[_number(name)]})
+        scenes = sorted({each.scene for each in self._instances[name]})
         return [self.download / MODELS, *(scene / file for scene in scenes for file in ANNOTATIONS)]
 
     def photographs(self, name: str) -> Annotated:
-        frame, instances = self._frames()[_number(name)], self._instances[_number(name)]
+        frame, instances = self._frames()[name], self._instances[name]
         visible = [each for each in instances if each.visible >= self.least_visible]
         hidden = Counter({"occluded": len(instances) - len(visible)})
         unit = _unit(visible, frame, f"{self.download}: object '{name}'")
         photographs = [_photograph(each, frame, unit) for each in visible]
         return Annotated(photographs, frame.corners(), +hidden, {"units": UNITS[unit]})
 
-    def _frames(self) -> dict[int, ObjectFrame]:
-        """The objects' frames in those of their models, by number; in their unit."""
+    def _frames(self) -> dict[str, ObjectFrame]:
+        """The objects' frames in those of their models; in their unit."""
         file, axes = self.download / MODELS, z_up_to_y_up(torch.eye(4, dtype=torch.float64))[:3, :3]
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
             frames = {}
             for number, info in read_json(file).items():
                 low, sides = (numbers([info[f"{key}_{axis}"] for axis in "xyz"], 3) for key in ("min", "size"))
-                frames[int(number)] = ObjectFrame(axes, low + sides / 2, sides.max(), axes @ sides / sides.max())
+                frames[_name(number)] = ObjectFrame(axes, low + sides / 2, sides.max(), axes @ sides / sides.max())
         if not frames or not all(frame.longest_side > 0 for frame in frames.values()):
             raise UserError(f"{file}: has no objects with an extent")
         return frames
 
     @cached_property
-    def _instances(self) -> defaultdict[int, list[Instance]]:
+    def _instances(self) -> defaultdict[str, list[Instance]]:
         """All annotated instances by object."""
         named = ((self.download / split, *sorted(self.download.glob(f"{split}_*"))) for split in self.splits)
         scenes = [file.parent for folder in chain(*named) for file in sorted(folder.glob("*/scene_gt.json"))]
         if not scenes:
             looked = ", ".join(f"{self.download}/{split}/*/scene_gt.json" for split in self.splits)
             raise UserError(f"{self.download}: has no annotated scenes; looked for {looked}")
-        found: defaultdict[int, list[Instance]] = defaultdict(list)
+        found: defaultdict[str, list[Instance]] = defaultdict(list)
         for scene in scenes:
             contents = [read_json(scene / file) for file in ANNOTATIONS]
             wanted = "need cameras, and obj_id and visib_fract of the same instances"
@@ -140,12 +140,12 @@ class HOPEv2Data(PhotographedData):
                         instance = Instance(
                             scene, image, scene / "mask_visib" / mask, visible, pose, cameras.get(image)
                         )
-                        found[int(pose["obj_id"])].append(instance)
+                        found[_name(pose["obj_id"])].append(instance)
         return found
 
 
-def _number(name: str) -> int:
-    return int(name.removeprefix("obj_"))
+def _name(number: str | int) -> str:
+    return f"obj_{int(number):06d}"
 
 
 def _unit(instances: Sequence[Instance], frame: ObjectFrame, name: str) -> float:
