@@ -230,9 +230,9 @@ def test_a_place_of_a_scene_has_the_energies_of_its_landscapes(bench: Workbench)
 
 def test_a_solver_that_refuses_a_start_leaves_the_others(bench: Workbench) -> None:
     scene = bench.scene("cup", 0, 1, PAPER)
-    place = bench.place(scene, [0.0, 0.0, -1.5], ["gauss_newton", "langevin"])
+    place = bench.place(scene, [0.0, 0.0, -1.5], ["ifusion", "langevin"])
     assert list(place.ways) == ["langevin"]
-    assert "starts with relative radii between" in place.refusals["gauss_newton"]
+    assert "starts with relative radii between" in place.refusals["ifusion"]
 
 
 def test_one_model_is_in_memory_at_a_time(bench: Workbench) -> None:
