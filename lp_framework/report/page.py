@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import plotly.graph_objects as go
@@ -39,18 +39,16 @@ from lp_framework.viz.style import CLASS_COLOURS
 
 PAGE = "report.html"
 LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of the runs are in the table alone
-MOST_PLOTS = 4_000_000  # letters that the plots of one run's pairs may take; the last ones are left out beyond it
 MOST_CAMERAS = 40
 WORST = 20  # pairs in the table of the worst
-NOTES = ("answer", "probability", "verdict", "second_longitude_degrees", "second_probability")  # of a photograph
+TRAINING, LANDSCAPE, OVERVIEW = "training.json", "landscape.json", "azimuth.json"
 POSE = ("latitude_degrees", "longitude_degrees", "radius")
-# What a damaged file leads to; `UserError` is a `ValueError`.
-BROKEN = (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, UndefinedError)
+# What a missing or damaged file leads to; `UserError` is a `ValueError`.
+BROKEN = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, UndefinedError, csv.Error,
+)  # fmt: skip
 HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passes"], strict=True))
-T = TypeVar("T")
-Record = Mapping[str, Any]
 About = tuple[str, str, Mapping[str, str]]  # title, subtitle, and the most important numbers by name
-Sections = Sequence[tuple[str, str, Callable[[Record], Mapping[str, Any]]]]  # title, template, and what fills it
 
 
 class Section(NamedTuple):
@@ -69,33 +67,41 @@ class RunPart(NamedTuple):
     sections: Sequence[Section]
 
 
-def run_part(folder: Path, file: str, about: Callable[[Record], About], sections: Sections) -> RunPart:
-    """By the record in its JSON `file`, empty where that is missing, with these sections and its configuration."""
-    record, missing = dict[str, Any](), ""
+class Contents(NamedTuple):
+    """What the page shows of a kind of run: the heading of several, the JSON file with the run's results, what the run
+    is, and by their titles the sections: a template, and what fills it from the run's folder.
+    """
+
+    heading: str
+    file: str
+    about: Callable[[Path], About]
+    sections: Mapping[str, tuple[str, Callable[[Path], Mapping[str, Any]]]]
+
+
+def run_part(folder: Path, contents: Contents) -> RunPart:
+    """The run in `folder`, with its configuration as the last section."""
     try:
-        record = _read(folder / file, lambda text: dict(json.loads(text)))
-    except UserError as error:
-        missing = str(error)
-
-    def reason(error: Exception) -> str:
-        damaged = f"its files are damaged ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
-        return str(error) if isinstance(error, UserError) else missing or damaged
-
-    def section(title: str, template: str, values: Callable[[Record], Mapping[str, Any]]) -> Section:
-        try:
-            return Section(title, render(f"{template}.html.j2", **values(record)))
-        except BROKEN as error:
-            return Section(title, render("note.html.j2", text=f"Not shown: {reason(error)}."))
-
-    try:
-        title, subtitle, numbers = about(record)
+        about = contents.about(folder)
     except BROKEN as error:
-        title, subtitle, numbers = folder.name, f"run without results: {reason(error)}", {}
-    config = record.get("config") or tried(lambda: saved_config(folder / "config.yaml"), None)
-    text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True) if isinstance(config, Mapping) else None
-    last = {"config": text, "versions": record.get("versions"), "folder": folder}
-    shown = [*sections, ("Configuration and versions", "configuration", lambda _: last)]
-    return RunPart(title, subtitle, numbers, [section(*each) for each in shown])
+        about = folder.name, f"run without results: {reason(error)}", {}
+    sections = []
+    configuration = {"Configuration and versions": ("configuration", partial(_configuration, contents.file))}
+    for title, (template, values) in {**contents.sections, **configuration}.items():
+        try:
+            content = render(f"{template}.html.j2", **values(folder))
+        except BROKEN as error:
+            content = render("note.html.j2", text=f"Not shown: {reason(error)}.")
+        sections.append(Section(title, content))
+    return RunPart(*about, sections)
+
+
+def reason(error: Exception) -> str:
+    """Why a part of a run cannot be shown."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, FileNotFoundError):
+        return f"there is no {Path(error.filename).name}"
+    return f"its files are damaged ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
 
 
 def render(template: str, **values: Any) -> str:
@@ -103,26 +109,22 @@ def render(template: str, **values: Any) -> str:
     return _ENVIRONMENT.get_template(template).render(values)
 
 
-def tried(value: Callable[[], T], otherwise: T) -> T:
-    """A value that is made of a run's files, or another where they are damaged."""
-    try:
-        return value()
-    except BROKEN:
-        return otherwise
+def read_record(file: Path) -> dict[str, Any]:
+    """The object in a JSON file."""
+    return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
 def read_rows(file: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file with a heading; `UserError` where it is missing or damaged."""
-    return _read(file, lambda text: list(csv.DictReader(io.StringIO(text, newline=""))))
+    """The rows of a CSV file with a heading."""
+    with file.open(newline="", encoding="utf-8") as content:
+        return list(csv.DictReader(content))
 
 
-def _read(file: Path, parse: Callable[[str], T]) -> T:
-    try:
-        return parse(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"there is no {file.name}") from None
-    except (OSError, ValueError, TypeError, RecursionError, csv.Error) as error:
-        raise UserError(f"{file.name} is damaged ({error})") from error
+def _configuration(results: str, folder: Path) -> dict[str, Any]:
+    record = read_record(folder / results) if (folder / results).is_file() else {}
+    config = dict(record.get("config") or saved_config(folder / "config.yaml"))
+    text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+    return {"config": text, "versions": record.get("versions"), "folder": folder}
 
 
 def packed(content: go.Figure | str) -> str:
@@ -169,8 +171,7 @@ def write_run_page(folder: Path, kind: Kind) -> Path:
 def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> Path:
     """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened."""
     if len(runs) == 1:
-        ((folder, kind),) = runs
-        part = PARTS[kind][1](folder)
+        part = run_part(runs[0][0], contents_of(*runs[0]))
         *sections, configuration = part.sections
         part = part._replace(sections=[*sections, *above, configuration])
     else:
@@ -199,30 +200,22 @@ def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> list[Section]:
     listed: list[dict[str, Any]] = []
     room = LARGEST
     for number, (folder, kind) in enumerate(runs):
-        part = PARTS[kind][1](folder)
+        contents = contents_of(folder, kind)
+        part = run_part(folder, contents)
         content = render("run.html.j2", part=part)
         fits = len(content) <= room
         room -= len(content) if fits else 0
-        shown = content if fits else None
-        listed.append({"number": number, "folder": folder, "kind": kind, "part": part, "content": shown})
+        run = {"number": number, "folder": folder, "part": part, "content": content if fits else None}
+        listed.append({"heading": contents.heading, **run})
     sections = []
-    for kind in dict.fromkeys(kind for _, kind in runs):
-        heading, some = PARTS[kind][0], [run for run in listed if run["kind"] == kind]
+    for heading in dict.fromkeys(run["heading"] for run in listed):
+        some = [run for run in listed if run["heading"] == heading]
         sections.append(Section(heading, render("runs.html.j2", caption=heading, runs=some)))
     return [*sections, Section("Run by run", render("opened.html.j2", runs=listed))]
 
 
-def _evaluation(folder: Path) -> RunPart:
-    sections: Sections = [
-        ("Summary", "summary", lambda result: {"rows": summary_rows(result), "result": result}),
-        ("Pairs, failures first", "pairs", partial(_pairs, folder)),
-        ("Objects", "objects", lambda result: _objects(result, read_rows(folder / "pairs.csv"))),
-        ("Errors", "errors", lambda _: _errors(read_rows(folder / "pairs.csv"))),
-    ]
-    return run_part(folder, RESULT, _about_evaluation, sections)
-
-
-def _about_evaluation(result: Record) -> About:
+def _about_evaluation(folder: Path) -> About:
+    result = read_record(folder / RESULT)
     config, unique = result["config"], result["metrics_unique_answer"]
     metrics, over = (result["metrics"], "all objects") if unique is None else (unique, "unique answer")
     median = metrics["rotation_error"]
@@ -239,33 +232,32 @@ def _about_evaluation(result: Record) -> About:
     )
 
 
-def _pairs(folder: Path, record: Record) -> dict[str, Any]:
+def _summary(folder: Path) -> dict[str, Any]:
+    result = read_record(folder / RESULT)
+    return {"rows": summary_rows(result), "unanswered": result.get("unanswered")}
+
+
+def _pairs(folder: Path) -> dict[str, Any]:
     """The pairs that a run keeps beside its pictures, each with its plots (packed, by kind) and the steps they show."""
-    if record.get("config", {}).get("pictures") is False:
-        raise UserError("the run was made with pictures=false")
-    examples = read_examples(folder / "pictures" / EXAMPLES)
-    shown: list[dict[str, Any]] = []
-    room = MOST_PLOTS
-    for example in examples:
-        kinds = {"map": plots.map_plot, "cameras": plots.pair_cameras_plot}
-        if example.landscapes:
-            kinds["surface"] = plots.surface_plot
-        drawn = {kind: packed(draw(example)) for kind, draw in kinds.items()}
-        room -= sum(map(len, drawn.values()))
-        if shown and room < 0:
-            break
+    if not (folder / "pictures").is_dir():
+        raise UserError("the run has no pictures, as with pictures=false")
+    shown = []
+    for example in read_examples(folder / "pictures" / EXAMPLES):
+        drawn = {kind: packed(figure) for kind, figure in plots.pair_plots(example).items()}
         shown.append({"example": example, "plots": drawn, "steps": plots.frame_steps(example)})
-    return {"pairs": shown, "left_out": len(examples) - len(shown)}
+    return {"pairs": shown}
 
 
-def _objects(result: Record, rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
+def _objects(folder: Path) -> dict[str, Any]:
+    rows, result = read_rows(folder / "pairs.csv"), read_record(folder / RESULT)
     found = {name: metrics for name, metrics in result["per_object"].items() if metrics is not None}
     order = sorted(found, key=lambda name: (found[name]["R(R)@15"], found[name].get("SR(R)@30", 0), name))
     classes, counts = {row["object"]: row["ambiguity"] for row in rows}, Counter(row["object"] for row in rows)
     return {"objects": {name: found[name] for name in order}, "classes_of": classes, "counts": counts}
 
 
-def _errors(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
+def _errors(folder: Path) -> dict[str, Any]:
+    rows = read_rows(folder / "pairs.csv")
     rotation = np.array([float(row["rotation_error_degrees"]) for row in rows])
     classes = np.array([row["ambiguity"] for row in rows])
     figure = plots.errors_plot({name: rotation[classes == name] for name in CLASS_COLOURS if name in classes})
@@ -274,22 +266,15 @@ def _errors(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
     return {"figure": figure, "worst": worst}
 
 
-def _training(folder: Path) -> RunPart:
-    sections = [
-        ("Losses", "losses", lambda _: _losses(folder)),
-        ("Last values", "last", lambda report: {"final": report["final"]}),
-    ]
-    return run_part(folder, "training.json", partial(_about_training, folder), sections)
-
-
-def _about_training(folder: Path, report: Record) -> About:
+def _about_training(folder: Path) -> About:
+    report = read_record(folder / TRAINING) if (folder / TRAINING).is_file() else {}
     config = saved_config(folder / "config.yaml")
     losses, _ = read_losses(folder / "metrics.csv")
     best = {"best validation loss": f"{np.nanmin(losses['val/loss'].value):.4g}"} if "val/loss" in losses else {}
     title = f"{words(config['model']['name'])} model, trained on {config['data']['name']}"
     if not report:
         return title, "training that has not finished", best
-    counts = {key: str(report[key]) for key in ("epochs", "steps") if key in report}
+    counts = {key: str(report[key]) for key in ("epochs", "steps")}
     return title, f"training over {report['epochs']} epochs, seed {report['seed']}", best | counts
 
 
@@ -300,15 +285,8 @@ def _losses(folder: Path) -> dict[str, Any]:
     return {"figure": plots.losses_plot(losses, rate)}
 
 
-def _estimate(folder: Path) -> RunPart:
-    sections: Sections = [
-        ("Cameras", "cameras", lambda _: _cameras(folder)),
-        ("Poses", "poses", partial(_poses, folder)),
-    ]
-    return run_part(folder, RESULT, partial(_about_estimate, folder), sections)
-
-
-def _about_estimate(folder: Path, result: Record) -> About:
+def _about_estimate(folder: Path) -> About:
+    result = read_record(folder / RESULT)
     rows = read_rows(folder / "poses.csv")
     found = sum(row["valid"] == "True" for row in rows)
     verdicts = Counter(row.get("verdict") for row in rows)
@@ -327,49 +305,33 @@ def _cameras(folder: Path) -> dict[str, Any]:
     shown = rows[:MOST_CAMERAS]
     poses = np.array([[float(row[key]) for key in POSE] for row in shown])
     poses[:, :2] = np.radians(poses[:, :2])
-    field_of_view = float(_read(folder / "transforms.json", json.loads)["camera_angle_x"])
-    figure = plots.cameras_plot(poses, [_image(folder, row) for row in shown], field_of_view)
+    field_of_view = float(read_record(folder / "transforms.json")["camera_angle_x"])
+    figure = plots.cameras_plot(poses, _images(folder, shown), field_of_view)
     return {"figure": figure, "shown": len(shown), "count": len(rows)}
 
 
-def _poses(folder: Path, result: Record) -> dict[str, Any]:
+def _poses(folder: Path) -> dict[str, Any]:
     rows = read_rows(folder / "poses.csv")
-    keys = [*POSE, *(f"relative_{key}" for key in POSE)]
-    poses = [[float(row[key]) for key in keys] if row["valid"] == "True" else None for row in rows]
-    images = [tried(partial(_image, folder, row), None) for row in rows]
-    names = [Path(row["file"]).name for row in rows]
-    energies = [row["energy"] for row in rows]
-    notes = [[row.get(key, "") for key in NOTES] for row in rows] if any(row.get("verdict") for row in rows) else None
-    masks = [tried(partial(_mask, folder, row), None) for row in rows] if result.get("masks_by") else None
     return {
-        "rows": list(zip(names, images, poses, energies, strict=True)),
-        **{"notes": notes, "masks": masks, "masks_by": result.get("masks_by")},
+        "rows": list(zip(rows, _images(folder, rows), strict=True)),
+        "masks": {file.name: _image(file) for file in (folder / "masks").glob("*.png")},
+        "masks_by": read_record(folder / RESULT).get("masks_by"),
+        "notes": any(row.get("verdict") for row in rows),
     }
 
 
-def _mask(folder: Path, row: Mapping[str, str]) -> NDArray:
-    """The mask `[H, W, 3]` that the run made for a row's image."""
-    with Image.open(folder / "masks" / Path(row["image"]).name) as mask:
-        return np.asarray(mask.convert("RGB"))
+def _images(folder: Path, rows: Sequence[Mapping[str, str]]) -> list[NDArray]:
+    """The prepared images of rows; only what lies in the run's own folder is read."""
+    return [_image(folder / "images" / Path(row["image"]).name) for row in rows]
 
 
-def _image(folder: Path, row: Mapping[str, str]) -> NDArray:
-    """The prepared image `[S, S, 4]` of a row; only what lies in the run's own folder is read."""
-    with Image.open(folder / "images" / Path(row["image"]).name) as image:
+def _image(file: Path) -> NDArray:
+    with Image.open(file) as image:
         return np.asarray(image.convert("RGBA"))
 
 
-def _landscape(folder: Path) -> RunPart:
-    if (folder / "landscape.json").is_file():
-        sections: Sections = [
-            ("Landscape", "pairs", partial(_pairs, folder)),
-            ("Pictures", "pictures", lambda _: {"files": _sheets(folder)}),
-        ]
-        return run_part(folder, "landscape.json", _about_landscape, sections)
-    return run_part(folder, "azimuth.json", _about_azimuths, [("Objects", "azimuths", lambda record: record)])
-
-
-def _about_landscape(record: Record) -> About:
+def _about_landscape(folder: Path) -> About:
+    record = read_record(folder / LANDSCAPE)
     files = " and ".join(Path(record[name]).name for name in ("reference", "query"))
     name = record["config"]["object"]
     numbers = {"minima": str(len(record["minima"])), "flatness along longitude": f"{record['flatness']:.2f}"}
@@ -380,14 +342,12 @@ def _about_landscape(record: Record) -> About:
     return title, "the energy of the prior over the relative pose of a pair, and the ways of a solver over it", numbers
 
 
-def _sheets(folder: Path) -> list[Path]:
-    files = [folder / f"{name}.png" for name in ("landscape", "fields") if (folder / f"{name}.png").is_file()]
-    if not files:
-        raise UserError("there is no landscape.png")
-    return files
+def _sheets(folder: Path) -> dict[str, Any]:
+    return {"files": [folder / "landscape.png", *folder.glob("fields.png")]}  # photographs have no fields
 
 
-def _about_azimuths(record: Record) -> About:
+def _about_azimuths(folder: Path) -> About:
+    record = read_record(folder / OVERVIEW)
     names = {"within": "least energy within 15°, all objects", "within_unique_answer": "the same, unique answer"}
     return (
         f"Landscapes of {record['config']['data']['name']}, prior {record['config']['prior']['name']}",
@@ -396,11 +356,25 @@ def _about_azimuths(record: Record) -> About:
     )
 
 
-# By the command, with the heading of its runs in a table of several.
-PARTS: Mapping[Kind, tuple[str, Callable[[Path], RunPart]]] = {
-    "eval": ("Evaluations", _evaluation), "train": ("Trainings", _training),
-    "estimate": ("Estimates", _estimate), "landscape": ("Landscapes", _landscape),
+CONTENTS: Mapping[str, Contents] = {
+    "eval": Contents("Evaluations", RESULT, _about_evaluation, {
+        "Summary": ("summary", _summary), "Pairs, failures first": ("pairs", _pairs),
+        "Objects": ("objects", _objects), "Errors": ("errors", _errors)}),
+    "train": Contents("Trainings", TRAINING, _about_training, {
+        "Losses": ("losses", _losses), "Last values": ("last", lambda folder: read_record(folder / TRAINING))}),
+    "estimate": Contents("Estimates", RESULT, _about_estimate, {
+        "Cameras": ("cameras", _cameras), "Poses": ("poses", _poses)}),
+    "landscape": Contents("Landscapes", LANDSCAPE, _about_landscape, {
+        "Landscape": ("pairs", _pairs), "Pictures": ("pictures", _sheets)}),
+    "overview": Contents("Landscapes", OVERVIEW, _about_azimuths, {
+        "Objects": ("azimuths", lambda folder: read_record(folder / OVERVIEW))}),
 }  # fmt: skip
+
+
+def contents_of(folder: Path, kind: Kind) -> Contents:
+    """What the page shows of a run; a `landscape` is that of a pair, or the overview of all objects."""
+    return CONTENTS["overview" if kind == "landscape" and not (folder / LANDSCAPE).is_file() else kind]
+
 
 _ENVIRONMENT = Environment(
     loader=PackageLoader("lp_framework.report"),
@@ -409,7 +383,10 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {"metric": metric, "picture": picture, "sheet": sheet, "words": words, "packed": packed}
+_ENVIRONMENT.filters |= {
+    "metric": metric, "name": lambda path: Path(path).name, "packed": packed, "picture": picture, "sheet": sheet,
+    "words": words,
+}  # fmt: skip
 _ENVIRONMENT.tests |= {"finite": math.isfinite}
 _ENVIRONMENT.globals |= {
     "classes": list(CLASS_COLOURS),

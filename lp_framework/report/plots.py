@@ -38,7 +38,7 @@ LOOK = {
     "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "hovermode": "closest",
     "margin": {"l": 54, "r": 16, "t": 10, "b": 44}, "xaxis": AXIS, "yaxis": AXIS,
     "scene": {"xaxis": AXIS, "yaxis": AXIS, "zaxis": AXIS, "aspectmode": "manual", "dragmode": "turntable"},
-    "legend": {"x": 0.99, "xanchor": "right", "bgcolor": SURFACE, "bordercolor": LINE, "borderwidth": 1},
+    "legend": {"orientation": "h", "x": 0, "y": 1.01, "yanchor": "bottom"},  # above the curves, which it would hide
     "hoverlabel": {"bgcolor": SURFACE, "bordercolor": LINE, "font": {"color": INK}},
     "uirevision": "kept",  # zoom and viewpoint stay when colours change
 }  # fmt: skip
@@ -50,11 +50,8 @@ GLOBE = 0.42  # object sizes, the radius
 OUTLINE = [0, 1, 2, 3, 0, 4, 1, 2, 4, 3]  # all edges of a frustum in one line
 
 Points = Callable[[NDArray], NDArray]  # from poses [S, 3] to points [T, 2] of the map, or [T, 3] in space
-
-
-Moving = tuple[
-    int, NDArray, Points
-]  # of a trace that the frames move: its number, ways [_, S, 3], where they are drawn
+# Of a trace that the frames move: its number, ways [_, S, 3], and where they are drawn.
+Moving = tuple[int, NDArray, Points]
 
 
 def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
@@ -64,7 +61,7 @@ def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
     figure = _figure(
         xaxis={"title": {"text": "rotation error (square-root scale)"}, "range": [0, math.sqrt(180)], **across},
         yaxis={"title": {"text": "share of pairs within the error"}, "range": [0, 1.01], "tickformat": ".0%"},
-        legend={"yanchor": "bottom", "y": 0.03},
+        showlegend=True,
     )
     for threshold in ROTATION_THRESHOLDS:
         figure.add_vline(math.sqrt(threshold), line={"color": MUTED, "width": 1, "dash": "dot"})
@@ -88,8 +85,7 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
         xaxis={"title": {"text": "training step"}, "anchor": "y" if rate is None else "y2"},
         yaxis={"title": {"text": "loss (log scale)"}, **loss},
         yaxis2={"title": {"text": "rate"}, **below},
-        legend={"yanchor": "top", "y": 0.99},
-        margin={"l": 64},
+        showlegend=True,
     )
     for (name, curve), colour in zip(losses.items(), (REFERENCE, ANSWER, GREY), strict=False):
         line = {"color": colour, "width": 2}
@@ -120,13 +116,19 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray], field_of_view: float
     return figure.add_trace(_trace(_centres(poses), mode="markers+text", marker=marker, hoverinfo="text", **text))
 
 
+def pair_plots(pair: ShownPair) -> dict[str, go.Figure]:
+    """The plots of a pair by their kind: from above, as relief where it has landscapes, and the cameras."""
+    relief = {"surface": _surface_plot(pair)} if pair.landscapes else {}
+    return {"map": _map_plot(pair), **relief, "cameras": _pair_cameras_plot(pair)}
+
+
 def frame_steps(pair: ShownPair) -> list[int]:
     """The steps of the solver that the frames of a pair show, the last one among them."""
     steps: list[int] = np.unique(np.linspace(0, _parts(pair)[1].shape[1] - 1, FRAMES).round().astype(int)).tolist()
     return steps
 
 
-def map_plot(pair: ShownPair) -> go.Figure:
+def _map_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes from above (degrees), and the ways of all starts over them."""
     ends = [pose[0] for pose in (pair.truth, _parts(pair)[1][0, -1]) if pose is not None]
     limit = max(60.0, *(abs(math.degrees(each)) + 5 for each in np.nan_to_num(ends)))
@@ -155,7 +157,7 @@ def map_plot(pair: ShownPair) -> go.Figure:
     return _framed(figure, pair, _add_moving(figure, pair, _on_map, others, (8, 12), line=edge))
 
 
-def surface_plot(pair: ShownPair) -> go.Figure:
+def _surface_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes as relief, with the ways of all starts on it; the truth is a pole."""
     angle = {"ticksuffix": "°", "showspikes": False}
     axes = {
@@ -202,7 +204,7 @@ def add_targets(figure: go.Figure, landscape: Landscape) -> None:
     )  # fmt: skip
 
 
-def pair_cameras_plot(pair: ShownPair) -> go.Figure:
+def _pair_cameras_plot(pair: ShownPair) -> go.Figure:
     """The cameras of a pair around a globe that bears the landscapes: both with their images, and where the ways go."""
     reference = pair.reference.pose
     distance = 0.32 * reference[2]
@@ -366,8 +368,7 @@ def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
 
 
 def _figure(**layout: Any) -> go.Figure:
-    own = {"showlegend": "legend" in layout, "font": FONT, **layout}
-    return go.Figure(layout={"template": {"layout": LOOK}, **own})
+    return go.Figure(layout={"template": {"layout": LOOK}, "showlegend": False, "font": FONT, **layout})
 
 
 def _scene(aspect: Sequence[float], eye: Sequence[float], below: float, **axes: Any) -> go.Figure:
