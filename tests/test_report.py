@@ -224,21 +224,6 @@ def test_the_papers_rows_stand_beside_those_they_are_compared_with(tmp_path):
     assert [line.paper for line in lines] == [False, True, False, True, True, True]
 
 
-def test_numbers_of_starts_and_of_views_are_columns(tmp_path):
-    for count in (2, 8):
-        for solver, recall in (("ifusion", 0.5), ("two_stage", 0.9)):
-            config = {"start.name": "random", "start.count": count, "solver.name": solver}
-            write_result(tmp_path / f"{solver}{count}", config, metrics(recall), "starts", seconds=count * 0.5)
-    (table,), _ = tables_of(tmp_path)
-    content = layout(table)
-    assert content.headings == ["solver", "runs", "metric", "start.count=2", "start.count=8"]
-    assert [list(line.cells) for line in content.lines[:2]] == [
-        ["ifusion", "1", "R@30", "0.500", "0.500"],
-        ["paper", "", "R@30", "0.661", "0.907"],
-    ]
-    assert ["two_stage", "1", "s/pair", "1", "4"] in [list(line.cells) for line in content.lines]
-
-
 def test_every_row_and_all_of_the_papers_are_in_the_csv(tmp_path):
     columns, rows = csv_rows(tables_of(gamma_sweep(tmp_path))[0])
     named = [dict(zip(columns, row, strict=True)) for row in rows]

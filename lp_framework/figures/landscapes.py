@@ -57,7 +57,6 @@ class LandscapesFigure(EnergyFigure):
         return with_prior_energy(pairs, shown, self.prior, self.draws._replace(seed=seed), self.grid)
 
     def draw(self, contents: list[ShownPair]) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         return maps.surfaces_figure(contents), (
             "The prior's denoising error over relative longitude and latitude, at the true relative radius, for a "
             f"reference (left) and a query (right) of {', '.join(pair.title for pair in contents)}; the line and the "
@@ -103,7 +102,6 @@ class TrajectoriesFigure(EnergyFigure):
         return pair, views.reshape(*poses.shape[:2], *views.shape[1:])
 
     def draw(self, contents: tuple[ShownPair, NDArray]) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         return maps.trajectories_figure(*contents, self.shown_steps), (
             f"(a) Reference and (b) query, {contents[0].title}. (c) Views that the prior generates from the reference "
             "at poses on each trajectory of iFusion, by the longitude of its start and the rotation error of its end. "
@@ -160,7 +158,6 @@ class FailuresFigure(EnergyFigure):
         return np.asarray(views[..., :3] * alpha + 1 - alpha)
 
     def draw(self, contents: list[maps.FailureRow]) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         mesh = "rendered from the mesh (top) and " if contents[0].rendered is not None else ""
         return maps.failures_figure(contents), (
             "(a) Reference above query. (b) Views turned around the object by the given longitudes from the reference, "
@@ -220,7 +217,6 @@ class ToyFigure(EnergyFigure):
         return replace(pair, maps=drawn), densities
 
     def draw(self, contents: tuple[ShownPair, dict[str, Landscape]]) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         return maps.toy_figure(*contents), (
             f"(a) Reference and query, {contents[0].title}; (b) exact score field; (c) of the score model; (d) of the "
             "prior's energy, in a scale of its own; (e) of the energy model; (f) exp(-E) of the prior's energy and (g) "
@@ -266,7 +262,6 @@ class ScoreVsEnergyFigure(PairsFigure):
         return fields.field_error(model, pairs, truths(shown), SPACING)
 
     def draw(self, contents: list[ShownPair]) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         titles = ("energy model, exp(\u2212E)", "energy model, \u2212\u2207E", "score model")
         return maps.comparison_figure(contents, titles), (
             "(a) Reference above query; (b) exp(-E) of the energy model over its greatest; (c) minus the gradient of "

@@ -22,7 +22,7 @@ from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.report.runs import find_runs
 from lp_framework.report.sweep_figures import is_swept, sweep_figure
-from lp_framework.report.sweep_tables import Objects, SweepTable, sweep_tables
+from lp_framework.report.sweep_tables import OVER, Objects, SweepTable, sweep_tables
 from lp_framework.viz.cameras import CameraScene, camera_methods_figure
 
 NAMES = {"ifusion": "iFusion", "id_pose": "ID-Pose", "two_stage": "two-stage"}  # as papers write them
@@ -81,7 +81,6 @@ class CamerasFigure(PaperFigure):
         return scenes
 
     def draw(self, contents: list[CameraScene]) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         names = ", ".join(scene.title for scene in contents)
         return camera_methods_figure(contents, self.named), (
             f"Predicted (thin) and true cameras (bold) of {len(contents[0].images) - 1} views of each object "
@@ -119,12 +118,10 @@ class RecallFigure(PaperFigure):
         return table
 
     def draw(self, contents: SweepTable) -> tuple[Figure, str]:
-        """See `PaperFigure`."""
         figure = sweep_figure(contents)
         assert figure is not None  # the number of starts varies
         seeds = max(len(row.seeds) for row in contents.rows)
-        over = "objects with a unique answer" if self.objects == "unique_answer" else "all objects"
         return figure, (
             "Recall within 30 degrees (and a translation error of 0.2) for different numbers of random starts, and for "
-            f"the seconds that they take, over {over}; bars: standard deviation over {seeds} seeds."
+            f"the seconds that they take, over {OVER[self.objects]}; bars: standard deviation over {seeds} seeds."
         )

@@ -32,7 +32,6 @@ PANELS = {"Recall R (chosen start)": RECALL, "Success rate SR (all starts)": SUC
 WITHIN = [f"within {degrees}°" for degrees in ROTATION_THRESHOLDS]
 TIME = "seconds a pair (log scale)"
 SECONDS, SOLVER = "seconds_per_pair", "solver.name"
-NONE = Spread(math.nan, math.nan)
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = (0, (3, 2))  # of the paper's curves
@@ -89,7 +88,7 @@ def cost_figure(table: SweepTable) -> Figure | None:
         return None
     return curves_figure(
         [
-            Panel(name, TIME, [_curve(_called(table, row), [row], None, name) for row in table.rows], logarithmic=True)
+            Panel(name, TIME, [_curve(label(row.settings), [row], None, name) for row in table.rows], logarithmic=True)
             for name in ROTATION_RECALL
         ]
     )
@@ -129,10 +128,10 @@ def rows_figure(rows: Mapping[str, Row]) -> Figure:
         for place, metric in enumerate(names):
             for line, row in enumerate(rows.values()):
                 if metric in row.metrics:
-                    mean, std = row.metrics[metric]
-                    drawn.append(mean)
+                    value = row.metrics[metric]
+                    drawn.append(value.mean)
                     axes.errorbar(
-                        mean, line, xerr=std, color=COLOURS[place], marker=MARKERS[place], markersize=5,
+                        value.mean, line, xerr=value.std, color=COLOURS[place], marker=MARKERS[place], markersize=5,
                         linestyle="none", elinewidth=1.2, capsize=2, clip_on=False, zorder=3,
                         markerfacecolor="white" if row.paper else COLOURS[place],
                     )  # fmt: skip
@@ -159,31 +158,17 @@ def is_swept(table: SweepTable, key: str) -> bool:
 def label(settings: Mapping[str, Any]) -> str:
     """Settings in a few words.
 
-    >>> label({"solver.name": "two_stage", "solver.gamma": 0.3})
-    'two_stage, gamma 0.3'
-    >>> label({"solver.first_stage": False, "solver.second_stage": True})
-    'without first stage'
-    >>> label({"solver.first_stage": True, "solver.second_stage": True})
-    'first stage and second stage'
+    >>> label({"solver.name": "two_stage", "solver.gamma": 0.3, "solver.second_stage": False})
+    'two_stage, gamma 0.3, without second stage'
     """
-    words, switches = [], {}
+    words = []
     for key, value in settings.items():
         last = heading(key).rpartition(".")[2].replace("_", " ")
         if isinstance(value, bool):
-            switches[last] = value
+            words.append(f"{'with' if value else 'without'} {last}")
         else:
             words.append(shown(value) if key.endswith(".name") or key == "checkpoint" else f"{last} {shown(value)}")
-    if switches and all(switches.values()):
-        words.append(" and ".join(switches))
-    elif switches:
-        words.append("without " + " or ".join(name for name, on in switches.items() if not on))
     return ", ".join(words)
-
-
-def _called(table: SweepTable, row: Row) -> str:
-    siblings = [each.settings for each in table.rows if each.settings.get(SOLVER) == row.settings.get(SOLVER)]
-    told = {key: value for key, value in row.settings.items() if any(each.get(key) != value for each in siblings)}
-    return label({SOLVER: row.settings.get(SOLVER), **told})
 
 
 def _panels(table: SweepTable, axis: str) -> list[Panel]:
@@ -215,8 +200,9 @@ def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str],
 
 def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:
     """A metric of rows over the setting `axis`, or over the seconds a pair."""
-    x = [row.metrics.get(SECONDS, NONE).mean if axis is None else float(row.settings[axis]) for row in rows]
-    mean, std = np.array([row.metrics[metric] for row in rows]).T
+    x = [row.metrics.get(SECONDS, Spread(math.nan)).mean if axis is None else float(row.settings[axis]) for row in rows]
+    values = [row.metrics[metric] for row in rows]
+    mean, std = (np.array([getattr(each, part) for each in values]) for part in ("mean", "std"))
     return Curve(title, np.array(x), mean, std, rows[0].paper)
 
 
@@ -237,8 +223,8 @@ def _legend(figure: Figure, labels: Sequence[str], paper: bool, markersize: floa
         look: dict[str, Any] = {"marker": "o", "markersize": markersize, "markerfacecolor": "white"}
         told = "the paper: other data, other prior"
         keys.append(Line2D([], [], color=MUTED, label=told, linewidth=1.0, linestyle=linestyle, **look))
-    lengths = [len(str(key.get_label())) + 9 for key in keys]
-    columns = len(keys) if sum(lengths) <= 120 else max(1, 120 // max(lengths))
+    longest = max(len(str(key.get_label())) for key in keys) + 9
+    columns = max(1, min(len(keys), 120 // longest))
     figure.legend(handles=keys, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 

@@ -24,17 +24,15 @@ Objects = Literal["unique_answer", "all"]
 METRICS = [*COLUMNS, *ERRORS, *COSTS]
 PRINTED = [f"{prefix}{degrees}" for degrees in ROTATION_THRESHOLDS for prefix in ("R@", "R(R)@")]
 PRINTED += [f"S{name}" for name in PRINTED] + [*ERRORS, *COSTS]  # in the paper's order
-ACROSS = {  # a number whose values become columns, and the metrics that are rows then, as in the paper's tables
-    "views": ("R@15", "R@30", "R(R)@15", "R(R)@30"),
-    "start.count": ("R@30", "R(R)@30", "SR(R)@30", "seconds_per_pair"),
-}
+OVER: dict[Objects, str] = {"unique_answer": "objects with a unique answer", "all": "all objects"}
 
 
-class Spread(NamedTuple):
+@dataclass(frozen=True)
+class Spread:
     """Mean over seeds and sample standard deviation (n - 1), NaN for a single seed or where it is not finite."""
 
     mean: float
-    std: float
+    std: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ class SweepTable:
             return []
         rows = []
         for row in self.paper.rows if settings is None else self.paper.matching(settings):
-            metrics = {name: Spread(value, math.nan) for name, value in row.metrics.items()}
+            metrics = {name: Spread(value) for name, value in row.metrics.items()}
             rows.append(Row(row.settings, metrics, source=f"paper: {row.label}"))
         return rows
 
@@ -217,9 +215,14 @@ class Layout(NamedTuple):
 
 
 def layout(table: SweepTable) -> Layout:
-    """The table as the paper would print it; the paper's own rows follow those that they are to be compared with."""
-    axis = next((key for key in ACROSS if len({str(row.settings.get(key)) for row in table.rows}) > 1), None)
-    return _down(table) if axis is None else _across(table, axis)
+    """A line a row, the metrics across; the paper's own rows follow those that they are to be compared with."""
+    labels = [*map(heading, table.columns), "runs"]
+    lines = []
+    for row in table.with_paper():
+        ours = [*(shown(row.settings.get(key)) for key in table.columns), str(len(row.runs))]
+        cells = [row.source, *[""] * len(table.columns)] if row.paper else ours
+        lines.append(Line([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
+    return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
 
 
 def terminal(content: Layout, width: int) -> list[Table]:
@@ -227,40 +230,27 @@ def terminal(content: Layout, width: int) -> list[Table]:
 
     Numbers that `width` columns do not hold go on in further tables, each with the labels.
     """
-    rows = [
-        [
-            *cells[: content.labels],
-            *(re.sub(r"\b0\.", ".", each).replace(" ± ", "\n±") for each in cells[content.labels :]),
-        ]
-        for cells, _ in content.lines
-    ]
-    headings = [
-        name if place < content.labels else re.sub(r"(.+)@(\d+)", r"@\2\n\1", name).replace(" ", "\n")
-        for place, name in enumerate(content.headings)
-    ]
-    columns = list(zip(headings, *rows, strict=True))
-    wide = [2 + max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
-    parts: list[list[int]] = []
-    room = 0
-    for place in range(content.labels, len(columns)):
-        if not parts or room < wide[place]:
-            parts.append([])
-            room = max(width - sum(wide[: content.labels]), wide[place])
-        parts[-1].append(place)
-        room -= wide[place]
-    return [_terminal_part(content, columns, part) for part in parts]
-
-
-def _terminal_part(content: Layout, columns: Sequence[Sequence[str]], numbers: Sequence[int]) -> Table:
-    printed = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    places = [*range(content.labels), *numbers]
-    for place in places:
-        is_number = place >= content.labels
-        how: dict[str, Any] = {"justify": "right", "no_wrap": True} if is_number else {"overflow": "fold"}
-        printed.add_column(columns[place][0], **how)
-    for line, (_, paper) in enumerate(content.lines, start=1):
-        printed.add_row(*(columns[place][line] for place in places), style="dim" if paper else "")
-    return printed
+    labels = range(content.labels)
+    columns = []
+    for place, cells in enumerate(zip(content.headings, *(line.cells for line in content.lines), strict=True)):
+        if place not in labels:
+            heading = re.sub(r"(.+)@(\d+)", r"@\2\n\1", cells[0]).replace(" ", "\n")
+            cells = heading, *(re.sub(r"\b0\.", ".", cell).replace(" ± ", "\n±") for cell in cells[1:])
+        columns.append(cells)
+    wide = [2 + max(len(line) for cell in cells for line in cell.split("\n")) for cells in columns]
+    fitting = max(1, (width - sum(wide[: len(labels)])) // max(wide[len(labels) :]))
+    tables = []
+    for first in range(len(labels), len(columns), fitting):
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+        for cells in columns[: len(labels)]:
+            table.add_column(cells[0], overflow="fold")
+        for cells in columns[first : first + fitting]:
+            table.add_column(cells[0], justify="right", no_wrap=True)
+        drawn = zip(*columns[: len(labels)], *columns[first : first + fitting], strict=True)
+        for line, cells in zip(content.lines, list(drawn)[1:], strict=True):
+            table.add_row(*cells, style="dim" if line.paper else "")
+        tables.append(table)
+    return tables
 
 
 def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]]]:
@@ -272,41 +262,10 @@ def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]
     for table in tables:
         for row in [*table.rows, *table.papers()]:
             settings = [row.settings.get(key) for key in keys]
-            metrics = [_rounded(each) for name in METRICS for each in row.metrics.get(name, (None, None))]
+            spreads = [row.metrics.get(name, Spread(math.nan)) for name in METRICS]
+            metrics = [_rounded(each) for spread in spreads for each in (spread.mean, spread.std)]
             rows.append([table.experiment, row.source, *settings, len(row.runs) or None, row.pairs, *metrics])
     return columns, rows
-
-
-def _down(table: SweepTable) -> Layout:
-    """A line a row, the metrics across."""
-    labels = [*map(heading, table.columns), "runs"]
-    lines = []
-    for row in table.with_paper():
-        ours = [*(shown(row.settings.get(key)) for key in table.columns), str(len(row.runs))]
-        cells = [row.source, *[""] * len(table.columns)] if row.paper else ours
-        lines.append(Line([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
-    return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
-
-
-def _across(table: SweepTable, axis: str) -> Layout:
-    """A line a metric of those that differ in the setting `axis` alone, the values of which are across."""
-    others = [key for key in table.columns if key != axis]
-    values = sorted({row.settings.get(axis) for row in table.rows}, key=in_order)
-    lines = []
-    for group in table.apart_from(axis):
-        settings = group[0].settings
-        ours = [[row.metrics for row in group if row.settings.get(axis) == value] for value in values]
-        theirs = [[row.metrics for row in table.papers({**settings, axis: value})] for value in values]
-        counts = "-".join(map(str, sorted({len(row.runs) for row in group})))
-        told = [*(shown(settings.get(key)) for key in others), counts]
-        for name in ACROSS[axis]:
-            for columns, labels, paper in ((ours, told, False), (theirs, ["paper", *[""] * len(others)], True)):
-                found = [next((each[name] for each in column if name in each), None) for column in columns]
-                if any(found):
-                    cells = [*labels, HEADINGS.get(name, name), *(_cell(name, value) for value in found)]
-                    lines.append(Line(cells, paper))
-    headings = [*map(heading, others), "runs", "metric", *(f"{heading(axis)}={shown(value)}" for value in values)]
-    return Layout(headings, len(others) + 2, lines)
 
 
 def _cell(name: str, value: Spread | None) -> str:
@@ -315,9 +274,9 @@ def _cell(name: str, value: Spread | None) -> str:
     return number(name, value.mean) + ("" if math.isnan(value.std) else f" ± {number(name, value.std)}")
 
 
-def _rounded(value: float | None) -> float | str | None:
+def _rounded(value: float) -> float | str | None:
     """A number of a CSV; one that is not known is left empty."""
-    if value is None or math.isnan(value):
+    if math.isnan(value):
         return None
     return round(value, 5) if math.isfinite(value) else "inf"
 
@@ -338,8 +297,7 @@ class Sweep(NamedTuple):
 
 def counted(objects: Objects) -> str:
     """In words, what the numbers are over."""
-    over = "objects with a unique answer" if objects == "unique_answer" else "all objects"
-    return f"metrics over {over}; mean and standard deviation over seeds"
+    return f"metrics over {OVER[objects]}; mean and standard deviation over seeds"
 
 
 def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> list[Section]:
@@ -355,12 +313,6 @@ def write_sweeps(
     write_csv(folder / "report.csv", *csv_rows([sweep.table for sweep in sweeps]))
     text = render("report.md.j2", sweeps=sweeps, left_out=left_out, counted=counted(objects))
     write_text(folder / "report.md", text)
-    tables = []
-    for sweep in sweeps:
-        rows = [
-            {**asdict(row), "metrics": {name: value._asdict() for name, value in row.metrics.items()}}
-            for row in sweep.table.rows
-        ]
-        tables.append({**asdict(sweep.table), "rows": rows, "figures": [file.name for file in sweep.files]})
+    tables = [{**asdict(sweep.table), "figures": [file.name for file in sweep.files]} for sweep in sweeps]
     missing = [{"folder": str(path), "reason": reason} for path, reason in left_out]
     write_json(folder / "report.json", {"objects": objects, "tables": tables, "left_out": missing, **about})
