@@ -236,7 +236,7 @@ def meshes(tmp_path_factory):
 def test_a_rendered_view_at_the_references_own_pose_is_the_reference(meshes):
     figure = FailuresFigure(["box"], views=4, data=meshes, prior=TWO_VALLEYS, timesteps=[500])
     (row,) = figure.analyse(0, CPU)
-    assert {"0°", "90°", "180°", "270°"} <= {text.get_text() for text in figure.draw([row])[0].texts}
+    assert {"0°", "90°", "180°", "270°"} <= {axes.get_title() for axes in figure.draw([row])[0].axes}
     assert row.rendered is not None and row.rendered.shape == (4, 256, 256, 3) and len(row.generated) == 4
     small = row.rendered[0].reshape(64, 4, 64, 4, 3).mean(axis=(1, 3))
     assert np.abs(small - row.pair.reference.image / 255).mean() < 0.01

@@ -17,7 +17,7 @@ from lp_framework.analysis.pairs import ShownPair, View, with_solution
 from lp_framework.data.views import read_views
 from lp_framework.geometry import relative_pose
 from lp_framework.solvers.base import Cost, Solution
-from lp_framework.viz.maps import captions
+from lp_framework.viz.maps import ends_in_words
 
 COARSE = ("latitude_step_degrees=40", "longitude_step_degrees=60", "timesteps=[500]")
 SHORT = ("solver.steps=3", "reference=0", "query=2", *COARSE)
@@ -113,9 +113,9 @@ def test_a_start_that_came_to_no_pose_is_left_out():
     found = with_solution(pair, solution, starts, 0).arrived()
     assert found.start_longitudes() == pytest.approx([0, math.degrees(2)]) and found.chosen == 1
     assert found.rotation_errors == pytest.approx([math.degrees(2), 0], abs=1e-3)
-    assert captions(found) == ["0°: 115° off", "115°: 0° off"] and found.energies.tolist() == [1.0, 0.5]
+    assert ends_in_words(found) == [("0°", "115° off"), ("115°", "0° off")] and found.energies.tolist() == [1.0, 0.5]
     own = with_solution(replace(pair, truth=None), solution, starts[:, :2], 0).arrived()
-    assert own.starts is None and np.isnan(own.rotation_errors).all() and captions(own) == ["", ""]
+    assert own.starts is None and np.isnan(own.rotation_errors).all() and ends_in_words(own) == [("", "")] * 2
     assert own.start_longitudes() == [None, None]
     lost = with_solution(pair, replace(solution, chosen=torch.tensor([1])), starts, 0).arrived()
     assert lost.chosen is None and lost.failed and len(lost.ends) == 2

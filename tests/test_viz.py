@@ -48,7 +48,7 @@ from lp_framework.viz.curves import (
 )
 from lp_framework.viz.maps import broken_at_seam, draw_map, pair_figure
 from lp_framework.viz.sheets import ObjectCard, objects_figure
-from lp_framework.viz.style import ANSWER, save_figure
+from lp_framework.viz.style import ANSWER, CLASS_COLOURS, save_figure
 
 TRUTH = torch.tensor([0.3, 5.6, 0.2])
 IMAGE = np.zeros((8, 8, 3), dtype=np.uint8)
@@ -260,7 +260,7 @@ def test_cumulative_of_nothing_reached_is_zero():
 
 
 def names_on(figure: Figure) -> list[str]:
-    return [text.get_text() for axes in figure.axes for text in axes.texts if text.get_fontweight() == "bold"]
+    return [axes.get_title("left") for axes in figure.axes]
 
 
 def test_objects_are_sorted_worst_first():
@@ -272,8 +272,13 @@ def test_objects_are_sorted_worst_first():
     ]
     figure = objects_figure(cards)
     assert names_on(figure) == ["bad", "tie a", "tie b", "good"]
-    numbers = [text.get_text() for text in figure.axes[1].texts]
-    assert numbers == ["bad", "R(R)@15", "0.10", "SR(R)@30", "0.80"]
+    assert [axes.get_xlabel() for axes in figure.axes[:2]] == [
+        "R(R)@15 0.10\nSR(R)@30 0.80",
+        "R(R)@15 0.50\nSR(R)@30 0.40",
+    ]
+    frames = [to_hex(axes.spines["left"].get_edgecolor()) for axes in figure.axes]
+    classes = ("twofold", "continuous", "unique", "unique")
+    assert frames == [CLASS_COLOURS[each].lower() for each in classes]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["unique", "twofold", "continuous"]
 
 
@@ -283,6 +288,7 @@ def test_sheet_of_many_objects_keeps_the_worst(monkeypatch: pytest.MonkeyPatch):
     figure = objects_figure(cards)
     assert len(names_on(figure)) == 9 and "the 9 worst of 12" in figure.texts[0].get_text()
     # Cards do not overlap, and stay on the page.
+    figure.draw_without_rendering()
     boxes = [axes.get_position() for axes in figure.axes]
     assert all(box.x0 >= 0 and box.x1 <= 1 and box.y0 >= -1e-9 and box.y1 <= 1 for box in boxes)
     assert not any(

@@ -40,7 +40,7 @@ def figure_of(poses: NDArray) -> Figure:
 
 
 def test_the_projection_is_parallel_with_up_upwards():
-    view = Scene(viewpoint(0.4, 0.7), np.zeros((1, 3)), 1.0)
+    view = Scene(Figure().subplots(), viewpoint(0.4, 0.7), 1.0)
     towards = camera_to_world(torch.tensor([0.4, 0.7, 1.0], dtype=torch.float64))[:3, 3].numpy()
     np.testing.assert_allclose(view.project(towards), 0, atol=1e-12)
     assert view.nearness(towards) == pytest.approx(1) and view.nearness(-towards) == pytest.approx(-1)
@@ -83,6 +83,7 @@ def test_the_viewpoint_keeps_cameras_apart():
 def test_images_lie_in_their_planes():
     poses = np.array([[0.2, 0.0, 1.4], [-0.3, 2.0, 1.5], [0.5, 4.0, 1.2]])
     figure = figure_of(poses)
+    figure.draw_without_rendering()
     scene = figure.axes[0]
     view = best_viewpoint(poses)
     matrices = camera_to_world(torch.from_numpy(poses)).numpy()
@@ -110,7 +111,7 @@ def test_verdicts_are_written_and_colour_their_cameras():
     poses = np.array([[0.0, 0.0, 1.4], [0.0, 1.0, 1.4], [0.0, 2.0, 1.4]])
     images = [Image.fromarray(draw_view(pose, 32)) for pose in poses]
     figure = cameras_figure(poses, images, range(3), ["a", "b", "c"], 49.1, ["", "trust", "do not trust"])
-    colours = {text.get_text(): text.get_color() for text in figure.texts}
+    colours = {text.get_text(): text.get_color() for axes in figure.axes[1:] for text in axes.texts}
     assert colours["trust"] == cameras.TRUSTED["trust"] != colours["do not trust"] == cameras.TRUSTED["do not trust"]
 
 
@@ -144,15 +145,13 @@ def test_every_camera_is_numbered_and_has_a_card(count: int, tmp_path: Path):
     numbers = [text.get_text() for text in scene.texts if not text.get_text().endswith("°")]
     assert sorted(numbers, key=int) == [str(index) for index in range(count)]
     assert all(isinstance(card.images[0], AxesImage) for card in cards)
-    written = [text.get_text() for text in figure.texts[2:]]
-    for index in range(shown):
+    for index, card in enumerate(cards):
         latitude, longitude, radius = np.rad2deg(poses[index, 0]), np.rad2deg(poses[index, 1]), poses[index, 2]
         sign = "\N{MINUS SIGN}" if latitude < 0 else ""
-        assert written[3 * index : 3 * index + 3] == [
-            str(index), f"{index}.png",
-            f"latitude {sign}{abs(latitude):.1f}°\nlongitude {longitude:.1f}°\nradius {radius:.2f}",
-        ]  # fmt: skip
-    note = figure.texts[1].get_text()
+        assert (card.texts[0].get_text(), card.get_title("left")) == (str(index), f"{index}.png")
+        pose = f"latitude {sign}{abs(latitude):.1f}°\nlongitude {longitude:.1f}°\nradius {radius:.2f}"
+        assert card.get_xlabel() == pose
+    note = figure.subfigs[0].get_suptitle()
     assert note == "0 is the reference" + ("; below, 12 of 15 images" if count == 15 else "")
     boxes = [axes.get_position() for axes in figure.axes]
     assert all(box.x0 >= -1e-9 and box.x1 <= 1 + 1e-9 and box.y0 >= -1e-9 and box.y1 <= 1 + 1e-9 for box in boxes)

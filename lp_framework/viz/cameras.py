@@ -21,16 +21,24 @@ from scipy.spatial.distance import pdist
 from lp_framework.data.photographs import on_white
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz import style
-from lp_framework.viz.style import ASIDE, BLUE, FAINT, INK, MUTED, VERMILION, Sheet, letter, shortened, styled
+from lp_framework.viz.style import (
+    ASIDE,
+    BLUE,
+    FAINT,
+    INK,
+    MUTED,
+    VERMILION,
+    letter,
+    page,
+    shortened,
+    show_image,
+    styled,
+)
 
 ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the second relative to the reference
 NEAR_BY = 0.34  # how far from a camera its image is drawn, as a share of the largest radius
 LARGEST = 128  # pixels a side of an image in the scene, but for the one in the middle
-SIDE = 0.1  # inches: the margin
 MOST_CARDS, CARD_COLUMNS = 12, 6
-# Inches: the figure's width, the title, the tallest scene, the text below an image, gaps between images.
-WIDTH, TOP, TALLEST, TEXT, GAP = 8.0, 0.3, 4.6, 0.66, 0.12
-
 TRUSTED = {"trust": style.GREEN, "doubtful": style.ORANGE, "do not trust": VERMILION}  # a colour a verdict
 
 # Of the figure of methods.
@@ -40,10 +48,7 @@ FRUSTUM = 0.2  # of the largest radius
 # True cameras are wide and light, so that a predicted one on them can be seen.
 TRUE: dict[str, Any] = {"linewidth": 2.4, "alpha": 0.55}
 PREDICTED: dict[str, Any] = {"linewidth": 0.9}
-# Inches: the figure's width, the column of images, room for titles and for the key, gaps.
-METHODS_WIDTH, IMAGES, TITLE, KEY, BETWEEN, APART = 7.0, 2.0, 0.22, 0.26, 0.05, 0.08
 IMAGE_COLUMNS = 3
-IMAGE = (IMAGES - BETWEEN * (IMAGE_COLUMNS - 1)) / IMAGE_COLUMNS
 
 
 def viewpoint(latitude: float, longitude: float) -> NDArray:
@@ -82,12 +87,18 @@ ROUND, SPOKES = (
 
 
 class Scene:
-    """What is seen of points `[K, 3]` from a viewpoint, and the ground, the plane of latitude 0, out to `radius`."""
+    """What is seen from a viewpoint of the ground, the plane of latitude 0 out to `radius`, and of what is on it."""
 
-    def __init__(self, view: NDArray, points: NDArray, radius: float) -> None:
-        self.view, self.radius = view, radius
-        seen = self.project(np.concatenate([points, 1.13 * radius * ROUND]))
-        self.low, self.high = seen.min(axis=0) - 0.06 * radius, seen.max(axis=0) + 0.06 * radius
+    def __init__(self, axes: Axes, view: NDArray, radius: float) -> None:
+        self.axes, self.view, self.radius = axes, view, radius
+        axes.set(aspect="equal")
+        axes.margins(0.08)
+        axes.axis("off")
+        outer, inner = (self.project(share * self.radius * ROUND) for share in (1, 0.5))
+        axes.add_patch(Polygon(outer, facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
+        axes.add_patch(Polygon(inner, fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
+        spokes = [[(0, 0), end] for end in self.project(self.radius * SPOKES)]
+        axes.add_collection(LineCollection(spokes, colors=FAINT, linewidths=0.4, zorder=1.1))
 
     def project(self, points: NDArray) -> NDArray:
         """Where points `[..., 3]` appear, `[..., 2]` (right, up; scene units)."""
@@ -96,22 +107,6 @@ class Scene:
     def nearness(self, points: NDArray) -> NDArray:
         """How near points `[..., 3]` are to us, `[...]`, in units of the radius."""
         return points @ self.view[:, 2] / self.radius
-
-    def height(self, wide: float) -> float:
-        """The height of axes that show it and are so wide."""
-        across, up = self.high - self.low
-        return float(wide * up / across)
-
-    def begin(self, axes: Axes) -> None:
-        """Draw into these axes from now on; the ground, with a line every 30 degrees of longitude, to begin with."""
-        self.axes = axes
-        axes.set(xlim=(self.low[0], self.high[0]), ylim=(self.low[1], self.high[1]), aspect="equal")
-        axes.axis("off")
-        outer, inner = (self.project(share * self.radius * ROUND) for share in (1, 0.5))
-        axes.add_patch(Polygon(outer, facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
-        axes.add_patch(Polygon(inner, fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
-        spokes = [[(0, 0), end] for end in self.project(self.radius * SPOKES)]
-        axes.add_collection(LineCollection(spokes, colors=FAINT, linewidths=0.4, zorder=1.1))
 
     def image(self, image: Image.Image, plane: NDArray, order: float) -> None:
         """An image in its plane (as `image_plane`); nothing where that is seen edge-on."""
@@ -147,45 +142,35 @@ def cameras_figure(
     """
     verdicts = verdicts or [""] * len(images)
     cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())
-    middle = image_plane(cameras[0], float(poses[0, 2]), half_angle)  # through the object's centre
     distance = furthest * (NEAR_BY if len(poses) <= 5 else 0.8 * NEAR_BY)
-    planes = [image_plane(camera, distance, half_angle) for camera in cameras]
-    points = np.concatenate([middle, *planes, cameras[:, :3, 3]])
-    scene = Scene(best_viewpoint(poses), points, furthest)
     colours = [BLUE, *(TRUSTED.get(verdict, VERMILION) for verdict in verdicts[1:])]
-    tall, cards = min(TALLEST, scene.height(WIDTH)), min(len(images), MOST_CARDS)
-    side = (WIDTH - 2 * SIDE - GAP * (CARD_COLUMNS - 1)) / CARD_COLUMNS
+    cards = min(len(images), MOST_CARDS)
     rows = math.ceil(cards / CARD_COLUMNS)
-    columns = math.ceil(cards / rows)
-
-    sheet = Sheet(WIDTH, TOP + tall + rows * (side + TEXT))
-    sheet.head("Cameras around the object")
     more = f"; below, {cards} of {len(images)} images" if len(images) > cards else ""
-    sheet.text(WIDTH - SIDE, 0.12, f"{numbers[0]} is the reference{more}", va="top", ha="right", **ASIDE)
-    scene.begin(sheet.axes(0, TOP, WIDTH, tall))
+    figure, body = page(8.0, 5.0 + 1.9 * rows, "Cameras around the object", f"{numbers[0]} is the reference{more}")
+    upper, lower = body.subfigures(2, 1, height_ratios=[4.5, 1.9 * rows])
+    scene = Scene(upper.subplots(), best_viewpoint(poses), furthest)
     for place, (x, y) in enumerate(scene.project(1.09 * furthest * SPOKES[::3])):
         scene.axes.text(x, y, f"{90 * place}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
-    scene.image(images[0], middle, order=100.0)
-    for camera, plane, image, number, colour in zip(cameras, planes, images, numbers, colours, strict=True):
-        _draw_camera(scene, camera[:3, 3], plane, shrunk(image), colour)
+    scene.image(images[0], image_plane(cameras[0], float(poses[0, 2]), half_angle), order=100.0)  # through the object
+    for camera, image, number, colour in zip(cameras, images, numbers, colours, strict=True):
+        _draw_camera(scene, camera[:3, 3], image_plane(camera, distance, half_angle), shrunk(image), colour)
         x, y = scene.project(camera[:3, 3])
         scene.axes.text(x, y, str(number), zorder=200.0, **_badge(colour))
 
+    places = lower.subplots(rows, math.ceil(cards / rows), squeeze=False).flat
     for index in range(cards):
-        row, column = divmod(index, columns)
-        x = (WIDTH - columns * (side + GAP) + GAP) / 2 + column * (side + GAP)
-        y = TOP + tall + row * (side + TEXT)
-        sheet.image(x, y, side, on_white(images[index]), color=colours[index], linewidth=1.0)
-        sheet.text(x + 0.08, y + side + 0.1, str(numbers[index]), **_badge(colours[index]))
-        name = shortened(titles[index], 14 * side - 3)
-        sheet.text(x + 0.2, y + side + 0.1, name, fontsize=7.5, fontweight="bold", va="center_baseline")
+        axes, colour = next(places), colours[index]
+        show_image(axes, on_white(images[index]), shortened(titles[index], 14), color=colour)
+        axes.text(0.07, 0.93, str(numbers[index]), transform=axes.transAxes, **_badge(colour))
         latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
         pose = f"latitude {latitude:.1f}°\nlongitude {longitude:.1f}°\nradius {poses[index, 2]:.2f}"
-        sheet.text(x, y + side + 0.2, pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, va="top")
-        if verdicts[index]:
-            look = {"fontsize": 6, "fontweight": "bold", "color": colours[index], "ha": "right", "va": "top"}
-            sheet.text(x + side, y + side + 0.455, verdicts[index], **look)  # beside the radius
-    return sheet.figure
+        axes.set_xlabel(pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, loc="left")
+        look = {"fontsize": 6, "fontweight": "bold", "color": colour, "ha": "right", "va": "bottom"}
+        axes.text(0.98, 0.02, verdicts[index], transform=axes.transAxes, **look)
+    for axes in places:
+        axes.remove()
+    return figure
 
 
 def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: Image.Image, colour: str) -> None:
@@ -220,37 +205,29 @@ class CameraScene(NamedTuple):
 @styled
 def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]) -> Figure:
     """A row an object: its images, the reference framed in red, and a scene a method; true cameras are bold."""
-    wide = (METHODS_WIDTH - 2 * SIDE - IMAGES - APART * len(methods)) / len(methods)
-    rows = []
-    for each in objects:
-        points = _cameras(np.concatenate([each.poses, *(poses.reshape(-1, 3) for poses in each.predicted)]))[:, :3, 3]
-        scene = Scene(best_viewpoint(each.poses), points, float(each.poses[:, 2].max()))
-        images = math.ceil(len(each.images) / IMAGE_COLUMNS) * (IMAGE + BETWEEN) - BETWEEN
-        rows.append((each, scene, images, max(scene.height(wide), images)))
-    sheet = Sheet(METHODS_WIDTH, KEY + sum(tall + TITLE + APART for *_, tall in rows))
-    top = TITLE
-    for row, (each, scene, images, tall) in enumerate(rows):
-        sheet.above(SIDE, top, f"(a) {each.title}" if row == 0 else each.title)
+    figure = Figure(figsize=(7.0, 0.3 + 1.7 * len(objects)), layout="constrained")
+    parts = figure.subfigures(
+        len(objects), 1 + len(methods), squeeze=False, width_ratios=[2.0, *[4.8 / len(methods)] * len(methods)]
+    )
+    for row, (each, (left, *panels)) in enumerate(zip(objects, parts, strict=True)):
+        left.suptitle(letter(0, each.title) if row == 0 else each.title, x=0.02, ha="left", fontsize=8.5)
+        places = left.subplots(math.ceil(len(each.images) / IMAGE_COLUMNS), IMAGE_COLUMNS, squeeze=False).flat
         for index, image in enumerate(each.images):
-            line, column = divmod(index, IMAGE_COLUMNS)
-            x, y = SIDE + column * (IMAGE + BETWEEN), top + (tall - images) / 2 + line * (IMAGE + BETWEEN)
-            sheet.image(x, y, IMAGE, on_white(image), color=colour_of(index), linewidth=1.4)
-        for number, (poses, word) in enumerate(zip(each.predicted, each.words, strict=True)):
-            x = SIDE + IMAGES + APART + number * (wide + APART)
-            scene.begin(sheet.axes(x, top, wide, tall))
+            show_image(next(places), on_white(image), color=colour_of(index), linewidth=1.4)
+        for axes in places:
+            axes.remove()
+        for number, (panel, poses, word) in enumerate(zip(panels, each.predicted, each.words, strict=True)):
+            scene = Scene(panel.subplots(), best_viewpoint(each.poses), float(each.poses[:, 2].max()))
             _draw_method(scene, each, poses)
-            if row == 0:
-                sheet.above(x, top, letter(number + 1, methods[number]))
-            sheet.above(x + wide, top, word, ha="right", **ASIDE)
-        top += tall + TITLE + APART
+            scene.axes.set_title(letter(number + 1, methods[number]) if row == 0 else "")
+            scene.axes.set_title(word, loc="right", **ASIDE)
     keys = [
         Line2D([], [], color=RED, label="reference", **TRUE),
         Line2D([], [], color=INK, label="true cameras, a colour a view", **TRUE),
         Line2D([], [], color=INK, label="predicted, one for each start", **PREDICTED),
     ]
-    spaces = {"columnspacing": 1.6, "handlelength": 1.8, "handletextpad": 0.8}
-    sheet.legend(keys, METHODS_WIDTH - SIDE, sheet.height - 0.18, **spaces)
-    return sheet.figure
+    figure.legend(handles=keys, loc="outside lower right", ncols=len(keys))
+    return figure
 
 
 def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray) -> None:

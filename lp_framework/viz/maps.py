@@ -23,24 +23,15 @@ from numpy.typing import NDArray
 from lp_framework.analysis.landscapes import FLAT, Landscape, LandscapeMinimum
 from lp_framework.analysis.pairs import PoseMap, ShownPair
 from lp_framework.viz import style
-from lp_framework.viz.style import ANSWER, ASIDE, FAINT, INK, OTHERS, TRUTH, Sheet, degrees, letter, styled
+from lp_framework.viz.style import ANSWER, ASIDE, FAINT, INK, OTHERS, TRUTH, degrees, letter, show_image, styled
 
 SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it
 # From dark valleys to light heights, evenly in lightness, so that grey and any kind of colour vision see the same.
 RELIEF = "cividis"
 LEVELS = 9  # contour lines
 
-# Of the page of a pair, in inches: its width, margins, and the room between images and maps for labels; the maps'
-# colour bar; the maps' labels and their key; between maps; a line above an image; sides of images.
-PAGE_WIDTH, MARGIN, TOP, PAGE_LABELS, BAR = 8.0, 0.1, 0.74, 0.62, 0.78
-BELOW, BETWEEN, CAPTION = 0.66, 0.38, 0.2
-IMAGE, LARGEST_VIEW = 1.72, 1.2
-
-# Of the paper's figures, in inches: width and margin, room for a title, gaps; maps, and the room for their labels.
-WIDTH, SIDE, TITLE, GAP = 7.0, 0.06, 0.24, 0.05
-TALL, WIDE, LABELS, BOTTOM = 1.16, 1.55, 0.46, 0.4
+WIDTH = 7.0  # inches, of the paper's figures
 COLUMNS = 3  # of surfaces
-SMALL = {**ASIDE, "fontsize": 7.0}
 
 
 def _mark(marker: str, size: float, face: str, edge: str, width: float, **others: Any) -> dict[str, Any]:
@@ -123,7 +114,8 @@ def _points(axes: Axes, poses: NDArray, limit: float, **mark: Any) -> None:
     # What lies on the seam is on both edges of the map, and none of its mark is cut off there.
     for shift in (0.0, 360.0, -360.0):
         shown = (np.abs(latitude) <= limit) & (np.abs(longitude + shift - 180) <= 180 + SEAM)
-        axes.plot(longitude[shown] + shift, latitude[shown], clip_on=False, **mark)
+        if shown.any():  # an empty line that is not clipped would take all of the layout's room
+            axes.plot(longitude[shown] + shift, latitude[shown], clip_on=False, **mark)
 
 
 def broken_at_seam(latitude: NDArray, longitude: NDArray) -> tuple[NDArray, NDArray]:
@@ -194,66 +186,54 @@ def pair_figure(
     generates at the ends: the paper's Figure 2.
     """
     limit = _limit(pair.truth, maps)
-    left = MARGIN + IMAGE + PAGE_LABELS
-    wide = PAGE_WIDTH - left - BAR
-    high = wide * limit / 180
-    tall = len(maps) * (high + BETWEEN) - BETWEEN
-    columns = max(1, min(len(views), 5))
-    view = min(LARGEST_VIEW, (wide - 0.1 * (columns - 1)) / columns)
-    below = tall + BELOW + bool(views) * CAPTION + -(-len(views) // columns) * (view + CAPTION)
-    content = max(2 * IMAGE + CAPTION, below)
-    sheet = Sheet(PAGE_WIDTH, TOP + content + MARGIN)
-    sheet.head(title, note)
-    sheet.image(MARGIN, TOP, IMAGE, pair.reference.image, "reference")
-    top = TOP + (content - below) / 2
-    lower = top + high + BETWEEN if len(maps) > 1 else TOP + content - IMAGE
-    sheet.image(MARGIN, lower, IMAGE, pair.query.image, "query")
-    for row, each in enumerate(maps):
-        axes = sheet.axes(left, top + row * (high + BETWEEN), wide, high)
+    rows, high = -(-len(views) // 5), len(maps) * (0.4 + 5.0 * limit / 180) + 0.5
+    below = 0.3 + 1.2 * rows if rows else 0.0
+    figure, body = style.page(8.0, 0.8 + max(4.0, high + below), title, note)
+    left, right = body.subfigures(1, 2, width_ratios=[1.9, 6.1])
+    for axes, name in zip(left.subplots(2, 1), ("reference", "query"), strict=True):
+        show_image(axes, getattr(pair, name).image, name)
+    upper, lower = right.subfigures(2, 1, height_ratios=[high, below]) if rows else (right, None)
+    panels = upper.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, each in zip(panels, maps, strict=True):
         drawn = draw_map(axes, each, pair.truth, limit)
-        axes.tick_params(labelbottom=row == len(maps) - 1)
         axes.set_ylabel("latitude")
     axes.set_xlabel("longitude of the query relative to the reference")
     if drawn is not None:
-        bar = sheet.axes(left + wide + 0.12, top, 0.1, tall)
-        label = "denoising error" if each.arrows is None else "score magnitude (1/rad)"
-        sheet.figure.colorbar(drawn, cax=bar).set_label(label)
-        bar.locator_params(axis="y", nbins=6)
-        bar.spines[:].set_visible(False)
-    sheet.legend(keys(maps, pair.truth), left + wide, top + tall + 0.42)
-    top += tall + BELOW + CAPTION
-    if views:
-        sheet.above(left, top, "Generated at the ends of the trajectories, by their starts", fontsize=8)
-    for number, (image, caption) in enumerate(zip(views, captions(pair), strict=bool(views))):
-        row, column = divmod(number, columns)
-        x, y = left + column * (wide - view) / max(1, columns - 1), top + row * (view + CAPTION) + CAPTION
-        frame: Any = {"color": ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
-        sheet.image(x, y, view, image, caption, **frame)
-    return sheet.figure
+        bar = upper.colorbar(drawn, ax=panels, aspect=30, pad=0.02)
+        bar.set_label("denoising error" if each.arrows is None else "score magnitude (1/rad)")
+        bar.outline.set_visible(False)
+    marks = keys(maps, pair.truth)
+    figure.legend(handles=marks, loc="outside lower right", ncols=len(marks), handletextpad=0.3, columnspacing=1.3)
+    if lower is not None:
+        lower.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
+        places = lower.subplots(rows, min(len(views), 5), squeeze=False).flat
+        for number, (image, words) in enumerate(zip(views, ends_in_words(pair), strict=True)):
+            frame: Any = {"color": ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
+            show_image(next(places), image, ": ".join(filter(None, words)), **frame)
+        for axes in places:
+            axes.remove()
+    return figure
 
 
 @styled
 def surface_figure(landscape: Landscape, truth: NDArray | None = None, title: str = "") -> Figure:
     """The landscape in 3-D over its own map; the true relative pose `[3]` (radians) is marked on both."""
-    sheet = Sheet(4.8, 3.6)
-    _draw_surface(sheet.axes(-0.096, -0.072, 4.704, 3.78, projection="3d"), landscape, truth)
-    sheet.head(title)
-    return sheet.figure
+    figure = Figure(figsize=(4.8, 3.6))
+    figure.suptitle(title, x=0.02, ha="left", fontsize=10, fontweight="bold")
+    _draw_surface(figure.add_axes((-0.02, -0.03, 0.98, 1.05), projection="3d"), landscape, truth)
+    return figure
 
 
-def small_surface(
-    sheet: Sheet, x: float, y: float, wide: float, tall: float, landscape: Landscape, truth: NDArray | None
-) -> Axes3D:
-    """A landscape as a small surface that fills a box of the sheet, in its own range."""
-    axes: Axes3D = sheet.axes(x, y, wide, tall, projection="3d")
+def small_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> None:
+    """A landscape as a small surface, in its own range."""
     _draw_surface(axes, landscape, truth)
     axes.set(xlabel="", ylabel="", zlabel="", xticks=[0, 90, 180, 270], yticks=[-30, 30])
     axes.patch.set_visible(False)
     axes.tick_params(labelsize=6, pad=-4)
     axes.locator_params(axis="z", nbins=3)
-    axes.set_box_aspect((2.0, 1.2, 0.95), zoom=1.16)  # axes in 3-D leave wide margins
+    axes.set_box_aspect((2.0, 1.2, 0.95), zoom=1.3)  # axes in 3-D leave wide margins
+    axes.set_in_layout(False)
     small_marks(axes)
-    return axes
 
 
 def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> None:
@@ -290,11 +270,6 @@ def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> 
         axis._axinfo["grid"].update(color=FAINT, linewidth=0.4)
 
 
-def captions(pair: ShownPair) -> list[str]:
-    """For every end of a pair the longitude of its start, and how far off it is, as far as they are known."""
-    return [": ".join(filter(None, each)) for each in ends_in_words(pair)]
-
-
 def ends_in_words(pair: ShownPair) -> list[tuple[str, str]]:
     """For every end of a pair the longitude of its start, and the rotation error, or empty where not known."""
     starts = ["" if longitude is None else f"{longitude:.0f}°" for longitude in pair.start_longitudes()]
@@ -315,54 +290,43 @@ def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:
 @styled
 def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
     """A column a pair: reference and query above the surface of the prior's energy, whose height is its own range."""
-    columns = min(COLUMNS, len(pairs))
-    wide, image, tall = (WIDTH - 2 * SIDE) / columns, 0.96, 1.72
-    sheet = Sheet(WIDTH, -(-len(pairs) // columns) * (TITLE + image + tall))
-    for number, pair in enumerate(pairs):
-        row, column = divmod(number, columns)
-        x, y = SIDE + column * wide, row * (TITLE + image + tall) + TITLE
-        sheet.above(x, y, letter(number, pair.title))
-        for place, view in enumerate((pair.reference, pair.query)):
-            sheet.image(x + place * (image + GAP), y, image, view.image)
-        sheet.above(x + 2 * image + GAP, y, minima_in_words(pair.prior_energy), ha="right", **ASIDE)
-        axes = small_surface(sheet, x - 0.06, y + image + 0.02, wide + 0.04, tall - 0.1, pair.prior_energy, pair.truth)
-        axes.set_xlabel("longitude", fontsize=7, labelpad=-8)
-        axes.set_ylabel("latitude", fontsize=7, labelpad=-8)
-    return sheet.figure
+    rows = -(-len(pairs) // COLUMNS)
+    figure = Figure(figsize=(WIDTH, 3.0 * rows), layout="constrained")
+    places = figure.subfigures(rows, COLUMNS, squeeze=False).flat
+    for number, (part, pair) in enumerate(zip(places, pairs, strict=False)):
+        panels = part.subplot_mosaic([["reference", "query"], ["surface", "surface"]], height_ratios=[1, 1.7],
+                                     per_subplot_kw={"surface": {"projection": "3d"}})  # fmt: skip
+        show_image(panels["reference"], pair.reference.image, letter(number, pair.title))
+        show_image(panels["query"], pair.query.image)
+        panels["query"].set_title(minima_in_words(pair.prior_energy), loc="right", **ASIDE)
+        small_surface(panels["surface"], pair.prior_energy, pair.truth)
+        panels["surface"].set_xlabel("longitude", fontsize=7, labelpad=-8)
+        panels["surface"].set_ylabel("latitude", fontsize=7, labelpad=-8)
+    return figure
 
 
 @styled
 def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -> Figure:
     """(a), (b) both images; (c) a row a trajectory, of `views` `[N, K, H, W, 3]` at `steps`; (d) the landscape."""
-    view, label, bottom = 0.58, 0.6, 0.06
-    tall = max(2.7, 0.18 + len(views) * (view + GAP) - GAP)
-    image = min(1.1, (tall - TITLE) / 2)
-    sheet = Sheet(WIDTH, TITLE + tall + bottom)
-    for number, (name, each) in enumerate((("reference", pair.reference), ("query", pair.query))):
-        y = TITLE + number * (tall - image)
-        sheet.image(SIDE, y, image, each.image)
-        sheet.above(SIDE, y, letter(number, name))
-    left = SIDE + image + 0.12
-    sheet.above(left, TITLE, "(c) generated on the way")
-    for column, step in enumerate(steps):
-        sheet.text(left + label + column * (view + GAP) + view / 2, TITLE + 0.12, f"step {step}", ha="center", **SMALL)
-    for number, (row, (start, off)) in enumerate(zip(views, ends_in_words(pair), strict=True)):
-        y = TITLE + 0.18 + number * (view + GAP)
+    figure = Figure(figsize=(WIDTH, max(3.0, 0.4 + 0.65 * len(views))), layout="constrained")
+    left, middle, right = figure.subfigures(1, 3, width_ratios=[1.2, 0.6 + 0.62 * len(steps), 2.5])
+    _draw_pair(left.subplots(2, 1), pair)
+    middle.suptitle("(c) generated on the way", x=0.02, ha="left", fontsize=8.5)
+    grid = middle.subplots(*views.shape[:2], squeeze=False)
+    for number, (row, words) in enumerate(zip(grid, ends_in_words(pair), strict=True)):
         answer = number == pair.chosen
-        look: Any = {"fontsize": 7, "color": ANSWER if answer else INK}
-        sheet.text(left, y + view / 2, f"from {start}", va="bottom", **look)
-        sheet.text(left, y + view / 2, off, va="top", **look)
-        for column, picture in enumerate(row):
-            frame: Any = {"color": ANSWER, "linewidth": 1.2} if answer else {}
-            sheet.image(left + label + column * (view + GAP), y, view, picture, **frame)
-    x = left + label + len(steps) * (view + GAP) + 0.44
-    wide = WIDTH - SIDE - x
-    high = wide * 0.52
-    sheet.above(x, TITLE, "(d) landscape")
-    _place_map(sheet, (x, TITLE, wide, high), PoseMap(relief=pair.prior_energy, ways=pair), pair.truth)
-    lower = TITLE + high + 0.26
-    small_surface(sheet, x - 0.2, lower, wide + 0.2, sheet.height - lower + 0.02, pair.prior_energy, pair.truth)
-    return sheet.figure
+        frame: Any = {"color": ANSWER, "linewidth": 1.2} if answer else {}
+        for axes, image, step in zip(row, views[number], steps, strict=True):
+            show_image(axes, image, **frame)
+            if number == 0:
+                axes.set_title(f"step {step}", loc="center", **ASIDE)
+        start, off = words
+        row[0].set_ylabel(f"from {start}\n{off}", fontsize=7, rotation=0, ha="right", va="center",
+                          color=ANSWER if answer else INK)  # fmt: skip
+    above, below = right.subfigures(2, 1, height_ratios=[1, 1.1])
+    _small_map(above.subplots(), PoseMap("(d) landscape", relief=pair.prior_energy, ways=pair), pair.truth)
+    small_surface(below.subplots(subplot_kw={"projection": "3d"}), pair.prior_energy, pair.truth)
+    return figure
 
 
 class FailureRow(NamedTuple):
@@ -376,84 +340,72 @@ class FailureRow(NamedTuple):
 @styled
 def failures_figure(rows: Sequence[FailureRow]) -> Figure:
     """A row a pair: reference above query, views evenly around, rendered above generated, the landscape."""
-    longitudes = [360 * place / len(rows[0].generated) for place in range(len(rows[0].generated))]
-    image, wide = 0.7, 1.72
-    block = 2 * image + GAP
-    sheet = Sheet(WIDTH, TITLE + len(rows) * (block + TITLE) + 0.3)
-    left, right = SIDE + image + 0.42, WIDTH - SIDE - wide
-    view = min(image, (right - 0.55 - left + GAP) / len(longitudes) - GAP)
-    for x, title in ((SIDE, "(a) pair"), (left, "(b) turned around the object"), (right, "(c) landscape")):
-        sheet.above(x, TITLE, title)
-    for number, (pair, *swept) in enumerate(rows):
-        upper = 2 * TITLE + number * (block + TITLE)
-        sheet.above(SIDE, upper, pair.title, **ASIDE)
-        for place, each in enumerate((pair.reference, pair.query)):
-            sheet.image(SIDE, upper + place * (image + GAP), image, each.image)
-        lines = [(name, views) for name, views in zip(("mesh", "prior"), swept, strict=True) if views is not None]
-        top = upper + block / 2 - (len(lines) * (view + GAP) - GAP) / 2
-        for line, (name, views) in enumerate(lines):
-            y = top + line * (view + GAP)
-            sheet.text(left - 0.08, y + view / 2, name, fontsize=7.5, rotation=90, ha="right", va="center")
-            for column, picture in enumerate(views):
-                sheet.image(left + column * (view + GAP), y, view, picture)
-        for column, longitude in enumerate(longitudes):
-            sheet.above(left + column * (view + GAP) + view / 2, top, f"{longitude:g}°", ha="center", **SMALL)
-        box, last = (right, upper, wide, block - 0.1), number == len(rows) - 1
-        _place_map(sheet, box, PoseMap(relief=pair.prior_energy), pair.truth, last=last)
-    return sheet.figure
+    figure = Figure(figsize=(WIDTH, 0.3 + 1.75 * len(rows)), layout="constrained")
+    count = len(rows[0].generated)
+    for number, (part, (pair, *swept)) in enumerate(
+        zip(figure.subfigures(len(rows), 1, squeeze=False).flat, rows, strict=True)
+    ):
+        left, middle, right = part.subfigures(1, 3, width_ratios=[1.0, 0.3 + 0.55 * count, 2.2])
+        _draw_pair(left.subplots(2, 1), pair, [pair.title, ""])
+        lines = {name: views for name, views in zip(("mesh", "prior"), swept, strict=True) if views is not None}
+        grid = middle.subplots(len(lines), count, squeeze=False)
+        for row, (name, views) in zip(grid, lines.items(), strict=True):
+            row[0].set_ylabel(name, fontsize=7.5)
+            for axes, image in zip(row, views, strict=True):
+                show_image(axes, image)
+        for axes, place in zip(grid[0], range(count), strict=True):
+            axes.set_title(f"{360 * place / count:g}°", loc="center", **ASIDE)
+        _small_map(right.subplots(), PoseMap(relief=pair.prior_energy), pair.truth, last=number == len(rows) - 1)
+        if number == 0:
+            titles = ("(a) pair", "(b) turned around the object", "(c) landscape")
+            for each, title in zip((left, middle, right), titles, strict=True):
+                each.suptitle(title, x=0.02, ha="left", fontsize=8.5)
+    return figure
 
 
 @styled
 def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
     """(a) reference and query, then the pair's four maps and exp(-E) of two energies by title, in two rows."""
-    sheet = Sheet(WIDTH, 2 * (TITLE + TALL) + BOTTOM)
-    left = SIDE + TALL + LABELS
-    right = left + 2 * (WIDE + 0.12)
-    for row, (view, name) in enumerate(((pair.reference, "(a) reference"), (pair.query, "query"))):
-        y = TITLE + row * (TITLE + TALL)
-        sheet.image(SIDE, y, TALL, view.image)
-        sheet.above(SIDE, y, name)
-    for number, content in enumerate(pair.maps):
-        row, column = divmod(number, 2)
-        x, y = left + column * (WIDE + 0.12), TITLE + row * (TITLE + TALL)
-        sheet.above(x, y, letter(number + 1, content.title))
-        _place_map(sheet, (x, y, WIDE, TALL), content, pair.truth, first=column == 0, last=row == 1)
-    for row, (title, density) in enumerate(densities.items()):
-        y = TITLE + row * (TITLE + TALL)
-        sheet.above(right, y, letter(len(pair.maps) + 1 + row, title))
-        small_surface(sheet, right - 0.12, y - 0.1, WIDTH - right + 0.06, TALL + 0.15, density, pair.truth)
-    return sheet.figure
+    figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=[4.6, 2.2])
+    panels = left.subplot_mosaic("abc\nqde", width_ratios=[1.1, 1.5, 1.5])
+    _draw_pair([panels["a"], panels["q"]], pair, ["(a) reference", "query"])
+    for place, content in zip("bcde", pair.maps, strict=True):
+        titled = content._replace(title=f"({place}) {content.title}")
+        _small_map(panels[place], titled, pair.truth, first=place in "bd", last=place in "de")
+    surfaces = right.subplots(2, 1, subplot_kw={"projection": "3d"})
+    for axes, place, (title, density) in zip(surfaces, "fg", densities.items(), strict=True):
+        axes.set_title(f"({place}) {title}", y=0.95)
+        small_surface(axes, density, pair.truth)
+    return figure
 
 
 @styled
 def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figure:
     """A row a pair: reference above query, and its maps, their own titles small; `titles` are those of the columns."""
-    gap = 0.2
-    side = (TALL - GAP) / 2
-    left = SIDE + side + LABELS + 0.08
-    wide = (WIDTH - SIDE - left - 2 * gap) / 3
-    sheet = Sheet(WIDTH, TITLE + len(pairs) * (TITLE + TALL) + BOTTOM)
-    sheet.above(SIDE, TITLE, "(a) pair")
-    for column, title in enumerate(titles):
-        sheet.above(left + column * (wide + gap), TITLE, letter(column + 1, title))
-    for number, pair in enumerate(pairs):
-        y = 2 * TITLE + number * (TITLE + TALL)
-        sheet.above(SIDE, y, pair.title, **ASIDE)
-        for place, view in enumerate((pair.reference, pair.query)):
-            sheet.image(SIDE, y + place * (side + GAP), side, view.image)
+    figure = Figure(figsize=(WIDTH, 0.4 + 1.45 * len(pairs)), layout="constrained")
+    names = [[f"reference {row}", f"query {row}"] for row in range(len(pairs))]
+    mosaic = [[name, *(f"map {row} {column}" for column in range(len(titles)))]
+              for row, both in enumerate(names) for name in both]  # fmt: skip
+    panels = figure.subplot_mosaic(mosaic, width_ratios=[0.5, *[1.7] * len(titles)])
+    for row, (pair, both) in enumerate(zip(pairs, names, strict=True)):
+        _draw_pair([panels[name] for name in both], pair, [letter(0, pair.title) if row == 0 else pair.title, ""])
         for column, content in enumerate(pair.maps):
-            x, last = left + column * (wide + gap), number == len(pairs) - 1
-            sheet.above(x + wide, y, content.title, ha="right", **ASIDE)
-            _place_map(sheet, (x, y, wide, TALL), content, pair.truth, first=column == 0, last=last)
-    return sheet.figure
+            axes, last = panels[f"map {row} {column}"], row == len(pairs) - 1
+            title = letter(column + 1, titles[column]) if row == 0 else ""
+            _small_map(axes, content._replace(title=title), pair.truth, first=column == 0, last=last)
+            axes.set_title(content.title, loc="right", **ASIDE)
+    return figure
 
 
-def _place_map(
-    sheet: Sheet, box: Sequence[float], content: PoseMap, truth: NDArray | None, first: bool = True, last: bool = True
-) -> None:
-    """A small map without its title, labelled where it is the first of its row and in the last one."""
-    axes = sheet.axes(*box)
-    draw_map(axes, content._replace(title=""), truth)
+def _draw_pair(panels: Sequence[Axes], pair: ShownPair, titles: Sequence[str] = ("(a) reference", "(b) query")) -> None:
+    for axes, view, title in zip(panels, (pair.reference, pair.query), titles, strict=True):
+        show_image(axes, view.image, title)
+
+
+def _small_map(axes: Axes, content: PoseMap, truth: NDArray | None, first: bool = True, last: bool = True) -> None:
+    """A small map, labelled where it is the first of its row and in the last one."""
+    draw_map(axes, content, truth)
     axes.set(xticks=[0, 90, 180, 270], yticks=[-30, 0, 30])
     axes.tick_params(pad=2, labelleft=first, labelbottom=last)
     small_marks(axes)

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MultipleLocator, StrMethodFormatter
 from numpy.typing import NDArray
+from PIL.Image import Image
 
 from lp_framework.atomic import written
 
@@ -46,48 +47,22 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
     return files
 
 
-class Sheet:
-    """A figure that is laid out in inches, from its upper left corner."""
+def page(width: float, height: float, title: str, note: str = "") -> tuple[Figure, SubFigure]:
+    """A figure (inches) with a title and a note below it, and what is left of it for panels."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    body: SubFigure = figure.subfigures()
+    if note:
+        body.suptitle(note, x=0.01, ha="left", color=MUTED, fontsize=8)
+    return figure, body
 
-    def __init__(self, width: float, height: float) -> None:
-        self.width, self.height = width, height
-        self.figure = Figure(figsize=(width, height))
 
-    def axes(self, x: float, y: float, wide: float, tall: float, **settings: Any) -> Any:
-        """Axes (of matplotlib) in a box whose upper left corner is at (x, y)."""
-        box = (x / self.width, 1 - (y + tall) / self.height, wide / self.width, tall / self.height)
-        return self.figure.add_axes(box, **settings)
-
-    def image(self, x: float, y: float, side: float, image: NDArray, title: str = "", **frame: Any) -> Axes:
-        """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame, a title above it."""
-        axes = self.axes(x, y, side, side)
-        axes.imshow(image, interpolation="antialiased")
-        axes.set(xticks=[], yticks=[])
-        axes.spines[:].set(**{"color": FAINT, "linewidth": 0.8, **frame})
-        if title:
-            axes.set_title(title, color=MUTED, pad=3)
-        return axes
-
-    def text(self, x: float, y: float, text: str, **style: Any) -> None:
-        """Text at a place; it stands on it unless the style says otherwise."""
-        self.figure.text(x / self.width, 1 - y / self.height, text, **style)
-
-    def head(self, title: str, note: str = "") -> None:
-        """The title of the whole, and a note below it."""
-        self.text(0.1, 0.1, title, fontsize=10, fontweight="bold", va="top")
-        if note:
-            self.text(0.1, 0.3, note, color=MUTED, va="top")
-
-    def above(self, x: float, y: float, text: str, **style: Any) -> None:
-        """A line above a place, by default the title of a panel."""
-        self.text(x, y - 0.05, text, **{"fontsize": 8.5, **style})
-
-    def legend(self, keys: Sequence[Line2D], x: float, y: float, **style: Any) -> None:
-        """A key in one row, its upper right corner at (x, y)."""
-        place = (x / self.width, 1 - y / self.height)
-        layout = {"loc": "upper right", "ncols": len(keys), "borderaxespad": 0.0, "borderpad": 0.0}
-        spaces = {"columnspacing": 1.3, "handletextpad": 0.3, "handlelength": 1.4}
-        self.figure.legend(handles=keys, bbox_to_anchor=place, **{**layout, **spaces, **style})
+def show_image(axes: Axes, image: NDArray | Image, title: str = "", **frame: Any) -> None:
+    """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame, a title above it."""
+    axes.imshow(image, interpolation="antialiased")
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(**{"color": FAINT, "linewidth": 0.8, **frame})
+    axes.set_title(title, pad=3)
 
 
 def class_keys(classes: Sequence[str], **look: Any) -> list[Line2D]:
