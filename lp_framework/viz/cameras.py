@@ -21,29 +21,16 @@ from scipy.spatial.distance import pdist
 from lp_framework.data.photographs import on_white
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz import style
-from lp_framework.viz.style import (
-    ASIDE,
-    BLUE,
-    FAINT,
-    INK,
-    MUTED,
-    VERMILION,
-    letter,
-    page,
-    shortened,
-    show_image,
-    styled,
-)
 
 ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the second relative to the reference
 NEAR_BY = 0.34  # how far from a camera its image is drawn, as a share of the largest radius
 LARGEST = 128  # pixels a side of an image in the scene, but for the one in the middle
 MOST_CARDS, CARD_COLUMNS = 12, 6
-TRUSTED = {"trust": style.GREEN, "doubtful": style.ORANGE, "do not trust": VERMILION}  # a colour a verdict
+TRUSTED = {"trust": style.GREEN, "doubtful": style.ORANGE, "do not trust": style.VERMILION}  # a colour a verdict
 
 # Of the figure of methods.
 RED, SKY = "#D7191C", "#56B4E9"
-TARGETS = (BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, MUTED)  # a colour a target view
+TARGETS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, style.MUTED)  # a colour a target view
 FRUSTUM = 0.2  # of the largest radius
 # True cameras are wide and light, so that a predicted one on them can be seen.
 TRUE: dict[str, Any] = {"linewidth": 2.4, "alpha": 0.55}
@@ -95,10 +82,10 @@ class Scene:
         axes.margins(0.08)
         axes.axis("off")
         outer, inner = (self.project(share * self.radius * ROUND) for share in (1, 0.5))
-        axes.add_patch(Polygon(outer, facecolor="#F6F6F4", edgecolor=FAINT, linewidth=0.8, zorder=1))
-        axes.add_patch(Polygon(inner, fill=False, edgecolor=FAINT, linewidth=0.5, zorder=1.1))
+        axes.add_patch(Polygon(outer, facecolor="#F6F6F4", edgecolor=style.FAINT, linewidth=0.8, zorder=1))
+        axes.add_patch(Polygon(inner, fill=False, edgecolor=style.FAINT, linewidth=0.5, zorder=1.1))
         spokes = [[(0, 0), end] for end in self.project(self.radius * SPOKES)]
-        axes.add_collection(LineCollection(spokes, colors=FAINT, linewidths=0.4, zorder=1.1))
+        axes.add_collection(LineCollection(spokes, colors=style.FAINT, linewidths=0.4, zorder=1.1))
 
     def project(self, points: NDArray) -> NDArray:
         """Where points `[..., 3]` appear, `[..., 2]` (right, up; scene units)."""
@@ -131,7 +118,7 @@ def shrunk(image: Image.Image) -> Image.Image:
     return small
 
 
-@styled
+@style.styled
 def cameras_figure(
     poses: NDArray, images: Sequence[Image.Image], numbers: Sequence[int], titles: Sequence[str],
     field_of_view_degrees: float, verdicts: Sequence[str] = (),
@@ -143,15 +130,17 @@ def cameras_figure(
     verdicts = verdicts or [""] * len(images)
     cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())
     distance = furthest * (NEAR_BY if len(poses) <= 5 else 0.8 * NEAR_BY)
-    colours = [BLUE, *(TRUSTED.get(verdict, VERMILION) for verdict in verdicts[1:])]
+    colours = [style.BLUE, *(TRUSTED.get(verdict, style.VERMILION) for verdict in verdicts[1:])]
     cards = min(len(images), MOST_CARDS)
     rows = math.ceil(cards / CARD_COLUMNS)
     more = f"; below, {cards} of {len(images)} images" if len(images) > cards else ""
-    figure, body = page(8.0, 5.0 + 1.9 * rows, "Cameras around the object", f"{numbers[0]} is the reference{more}")
+    figure, body = style.page(
+        8.0, 5.0 + 1.9 * rows, "Cameras around the object", f"{numbers[0]} is the reference{more}"
+    )
     upper, lower = body.subfigures(2, 1, height_ratios=[4.5, 1.9 * rows])
     scene = Scene(upper.subplots(), best_viewpoint(poses), furthest)
     for place, (x, y) in enumerate(scene.project(1.09 * furthest * SPOKES[::3])):
-        scene.axes.text(x, y, f"{90 * place}°", color=MUTED, fontsize=7, ha="center", va="center", zorder=2)
+        scene.axes.text(x, y, f"{90 * place}°", color=style.MUTED, fontsize=7, ha="center", va="center", zorder=2)
     scene.image(images[0], image_plane(cameras[0], float(poses[0, 2]), half_angle), order=100.0)  # through the object
     for camera, image, number, colour in zip(cameras, images, numbers, colours, strict=True):
         _draw_camera(scene, camera[:3, 3], image_plane(camera, distance, half_angle), shrunk(image), colour)
@@ -161,7 +150,7 @@ def cameras_figure(
     places = lower.subplots(rows, math.ceil(cards / rows), squeeze=False).flat
     for index in range(cards):
         axes, colour = next(places), colours[index]
-        show_image(axes, on_white(images[index]), shortened(titles[index], 14), color=colour)
+        style.show_image(axes, on_white(images[index]), style.shortened(titles[index], 14), color=colour)
         axes.text(0.07, 0.93, str(numbers[index]), transform=axes.transAxes, **_badge(colour))
         latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
         pose = f"latitude {latitude:.1f}°\nlongitude {longitude:.1f}°\nradius {poses[index, 2]:.2f}"
@@ -176,7 +165,7 @@ def cameras_figure(
 def _draw_camera(scene: Scene, centre: NDArray, plane: NDArray, image: Image.Image, colour: str) -> None:
     order = 100.0 + 10 * float(scene.nearness(centre))
     height, sight = (scene.project(np.stack([centre, end])).T for end in (centre * [1, 0, 1], 0 * centre))
-    scene.axes.plot(*height, color=MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
+    scene.axes.plot(*height, color=style.MUTED, linewidth=0.7, marker="o", markersize=2, markevery=[1], zorder=3)
     scene.axes.plot(*sight, color=colour, linewidth=0.7, linestyle=(0, (2, 3)), zorder=3)
     corners = scene.project(plane)
     scene.axes.add_patch(Polygon(corners, facecolor="white", edgecolor="none", alpha=0.65, zorder=order))
@@ -202,7 +191,7 @@ class CameraScene(NamedTuple):
     words: Sequence[str]
 
 
-@styled
+@style.styled
 def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]) -> Figure:
     """A row an object: its images, the reference framed in red, and a scene a method; true cameras are bold."""
     figure = Figure(figsize=(7.0, 0.3 + 1.7 * len(objects)), layout="constrained")
@@ -210,21 +199,21 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
         len(objects), 1 + len(methods), squeeze=False, width_ratios=[2.0, *[4.8 / len(methods)] * len(methods)]
     )
     for row, (each, (left, *panels)) in enumerate(zip(objects, parts, strict=True)):
-        left.suptitle(letter(0, each.title) if row == 0 else each.title, x=0.02, ha="left", fontsize=8.5)
+        left.suptitle(style.letter(0, each.title) if row == 0 else each.title, x=0.02, ha="left", fontsize=8.5)
         places = left.subplots(math.ceil(len(each.images) / IMAGE_COLUMNS), IMAGE_COLUMNS, squeeze=False).flat
         for index, image in enumerate(each.images):
-            show_image(next(places), on_white(image), color=colour_of(index), linewidth=1.4)
+            style.show_image(next(places), on_white(image), color=colour_of(index), linewidth=1.4)
         for axes in places:
             axes.remove()
         for number, (panel, poses, word) in enumerate(zip(panels, each.predicted, each.words, strict=True)):
             scene = Scene(panel.subplots(), best_viewpoint(each.poses), float(each.poses[:, 2].max()))
             _draw_method(scene, each, poses)
-            scene.axes.set_title(letter(number + 1, methods[number]) if row == 0 else "")
-            scene.axes.set_title(word, loc="right", **ASIDE)
+            scene.axes.set_title(style.letter(number + 1, methods[number]) if row == 0 else "")
+            scene.axes.set_title(word, loc="right", **style.ASIDE)
     keys = [
         Line2D([], [], color=RED, label="reference", **TRUE),
-        Line2D([], [], color=INK, label="true cameras, a colour a view", **TRUE),
-        Line2D([], [], color=INK, label="predicted, one for each start", **PREDICTED),
+        Line2D([], [], color=style.INK, label="true cameras, a colour a view", **TRUE),
+        Line2D([], [], color=style.INK, label="predicted, one for each start", **PREDICTED),
     ]
     figure.legend(handles=keys, loc="outside lower right", ncols=len(keys))
     return figure

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLD
 from lp_framework.viz import style
-from lp_framework.viz.style import CLASS_COLOURS, INK, MUTED, TRUTH, VERMILION, open_frame, styled
 
 NEAREST = 0.01  # scene units; where the logarithmic axis of translation errors begins
 DASHED: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (3, 2)), "zorder": 2}
-LOSSES = {"train/loss": (style.BLUE, "training loss"), "val/loss": (VERMILION, "validation loss"),
+LOSSES = {"train/loss": (style.BLUE, "training loss"), "val/loss": (style.VERMILION, "validation loss"),
           "train/view_loss": (style.GREEN, "training, view readout")}  # fmt: skip
 COLUMNS = 4  # of objects
 
@@ -40,7 +39,7 @@ def cumulative(errors: NDArray, end: float) -> tuple[NDArray, NDArray]:
     return np.concatenate([[0.0], reached, [end]]), np.concatenate([[0.0], share, [last]])
 
 
-@styled
+@style.styled
 def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, classes: Sequence[str]) -> Figure:
     """Share of pairs within an error, a curve an ambiguity class: the chosen start and, dashed, all of several.
 
@@ -51,8 +50,8 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
     left, right = figure.subplots(1, 2, width_ratios=[1.7, 1], sharey=True)
     several = rotation.shape[1] > 1
     keys = []
-    for name in sorted(set(classes), key=list(CLASS_COLOURS).index):
-        rows, colour = np.array(classes) == name, CLASS_COLOURS[name]
+    for name in sorted(set(classes), key=list(style.CLASS_COLOURS).index):
+        rows, colour = np.array(classes) == name, style.CLASS_COLOURS[name]
         for axes, errors, end in ((left, rotation, 180.0), (right, translation, 4.0)):
             answer = np.take_along_axis(errors[rows], chosen[rows, None], axis=1)
             stairs = {"color": colour, "drawstyle": "steps-post"}
@@ -61,8 +60,8 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
                 axes.plot(*cumulative(errors[rows].ravel(), end), label=f"{name}, all starts", **stairs, **DASHED)
         keys.append(Line2D([], [], color=colour, label=f"{name} ({rows.sum()} pairs)"))
     if several:
-        keys.append(Line2D([], [], color=INK, label="chosen start"))
-        keys.append(Line2D([], [], color=INK, label=f"all {rotation.shape[1]} starts", **DASHED))
+        keys.append(Line2D([], [], color=style.INK, label="chosen start"))
+        keys.append(Line2D([], [], color=style.INK, label=f"all {rotation.shape[1]} starts", **DASHED))
     # Small errors matter most: a square-root axis gives them room and still begins at 0.
     left.set_xscale(
         "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * np.square(x))
@@ -79,20 +78,20 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
         axes.xaxis.set_major_locator(FixedLocator(sorted([*thresholds, *others])))
         axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}" + unit))
-        open_frame(axes)
+        style.open_frame(axes)
         for threshold in thresholds:
-            axes.axvline(threshold, color=MUTED, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
+            axes.axvline(threshold, color=style.MUTED, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
     figure.legend(handles=keys, loc="outside upper left", ncols=len(keys), columnspacing=1.6, handlelength=1.8)
     return figure
 
 
-@styled
+@style.styled
 def calibration_figure(bins: Sequence[Mapping[str, float]], title: str) -> Figure:
     """Share of right answers against their probability, of `evaluation.breakdown`'s bins; areas tell their pairs."""
     figure = Figure(figsize=(4.4, 4.4), layout="constrained")
     axes = figure.subplots()
     probability, right, pairs = (np.array([each[key] for each in bins]) for key in ("probability", "right", "pairs"))
-    axes.plot([0, 1], [0, 1], color=MUTED, label="calibrated", **DASHED)
+    axes.plot([0, 1], [0, 1], color=style.MUTED, label="calibrated", **DASHED)
     axes.plot(probability, right, color=style.BLUE, zorder=3)
     axes.scatter(probability, right, 20 + 600 * pairs / pairs.sum(), color=style.BLUE, alpha=0.6, zorder=4, linewidth=0)
     axes.set(xlim=(0, 1), ylim=(0, 1.02), aspect="equal", xlabel="probability that the model tells")
@@ -101,7 +100,7 @@ def calibration_figure(bins: Sequence[Mapping[str, float]], title: str) -> Figur
         axis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(title, loc="left")
     axes.legend(loc="upper left", frameon=False)
-    open_frame(axes)
+    style.open_frame(axes)
     return figure
 
 
@@ -142,18 +141,12 @@ def running_mean(values: NDArray, window: int) -> NDArray:
     return np.asarray(np.convolve(values, ones, "same") / np.convolve(np.ones_like(values), ones, "same"))
 
 
-@styled
+@style.styled
 def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
     """The losses by their logged names on a log scale, and below them the learning rate where there is one."""
-    heights = [3.2] if rate is None else [3.2, 1.0]
     figure = Figure(figsize=(8.0, 3.0 if rate is None else 3.8), layout="constrained")
-    panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    above = panels[0]
-    if rate is not None:
-        panels[1].plot(*rate, color=INK, linewidth=1.2)
-        panels[1].set(ylabel="learning rate", ylim=(0, None))
-        panels[1].ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
-    drawn = []
+    heights = [1.0] if rate is None else [3.2, 1.0]
+    above, *below = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for name, curve in losses.items():
         colour, label = LOSSES[name]
         window = len(curve.step) // 20
@@ -163,32 +156,29 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
             curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean of {window} records"
         marker = "" if len(curve.step) > 30 else "o"
         above.plot(*curve, color=colour, label=label, clip_on=False, marker=marker, markersize=3.5)
-        drawn.append(curve.value)
-    shown = np.concatenate(drawn)
-    shown = shown[np.isfinite(shown) & (shown > 0)]
-    if len(shown):
-        above.set_ylim(shown.min() / 1.6, shown.max() * 1.3)
-    if "val/loss" in losses and np.isfinite(losses["val/loss"].value).any():
-        step, value = losses["val/loss"]
-        best = int(np.nanargmin(value))
-        above.annotate(
-            f"best {value[best]:.3g}", (step[best], value[best]), xytext=(0, 7), textcoords="offset points",
-            ha="right", fontsize=7.5, color=VERMILION, zorder=5,
-            path_effects=[withStroke(linewidth=2.5, foreground="white")],
-        )  # fmt: skip
+        if name == "val/loss" and np.isfinite(curve.value).any():
+            best = int(np.nanargmin(losses[name].value))
+            step, value = curve.step[best], losses[name].value[best]
+            halo = [withStroke(linewidth=2.5, foreground="white")]
+            above.annotate(f"best {value:.3g}", (step, value), (0, 7), textcoords="offset points", ha="right",
+                           fontsize=7.5, color=colour, zorder=5, path_effects=halo)  # fmt: skip
     above.set(yscale="log", ylabel="loss (log scale)")
     above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     above.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     above.yaxis.set_minor_locator(NullLocator())
-    for axes in panels:
-        open_frame(axes)
-        axes.set_xlim(0, max(curve.step.max() for curve in losses.values()))
     above.legend(loc="lower left")
-    panels[-1].set_xlabel("training step")
+    for axes in below:
+        axes.plot(*rate, color=style.INK, linewidth=1.2)
+        axes.set(ylabel="learning rate", ylim=(0, None))
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))
+    for axes in figure.axes:
+        style.open_frame(axes)
+        axes.set_xlim(0, max(curve.step.max() for curve in losses.values()))
+    figure.axes[-1].set_xlabel("training step")
     return figure
 
 
-@styled
+@style.styled
 def azimuth_figure(objects: Sequence[Mapping[str, Any]]) -> Figure:
     """A panel an object; the truth is marked, and the share of pairs whose least energy is within 15 degrees of it.
 
@@ -199,20 +189,20 @@ def azimuth_figure(objects: Sequence[Mapping[str, Any]]) -> Figure:
     figure.set_layout_engine("constrained", wspace=0.04, hspace=0.06)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for axes, each in zip(grid.flat, objects, strict=False):
-        open_frame(axes)
-        axes.axvline(0, color=TRUTH, linewidth=2.5, alpha=0.8, zorder=1)
+        style.open_frame(axes)
+        axes.axvline(0, color=style.TRUTH, linewidth=2.5, alpha=0.8, zorder=1)
         # The circle is closed: what is at -180 is at 180 as well.
         place = [*each["degrees"], each["degrees"][0] + 360]
         above = np.array([*each["energy"], each["energy"][0]]) - min(each["energy"])
-        axes.plot(place, above, color=CLASS_COLOURS[each["ambiguity"]], zorder=3)
+        axes.plot(place, above, color=style.CLASS_COLOURS[each["ambiguity"]], zorder=3)
         axes.set_title(f"{each['object'].replace('_', ' ')}, {each['within']:.0%}")
         axes.set_xlim(-180, 180)
-        style.degrees(axes, "x", 90)
+        style.degrees(axes.xaxis, 90)
         axes.locator_params(axis="y", nbins=4)
     for axes in list(grid.flat)[len(objects) :]:
         axes.remove()
     figure.supxlabel("longitude from the truth; in the title: share of pairs whose least energy is within 15°", size=8)
     figure.supylabel("denoising error above its least", size=8)
     keys = style.class_keys([each["ambiguity"] for each in objects])
-    figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), labelcolor=MUTED)
+    figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), labelcolor=style.MUTED)
     return figure

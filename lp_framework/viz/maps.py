@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from lp_framework.analysis.landscapes import FLAT, Landscape, LandscapeMinimum
 from lp_framework.analysis.pairs import PoseMap, ShownPair
 from lp_framework.viz import style
-from lp_framework.viz.style import ANSWER, ASIDE, FAINT, INK, OTHERS, TRUTH, degrees, letter, show_image, styled
 
 SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it
 # From dark valleys to light heights, evenly in lightness, so that grey and any kind of colour vision see the same.
@@ -39,11 +38,11 @@ def _mark(marker: str, size: float, face: str, edge: str, width: float, **others
     return {"linestyle": "none", "marker": marker, **look, **others}
 
 
-TRUTH_MARK = _mark("*", 14, TRUTH, INK, 0.8)
-CHOSEN_MARK = _mark("D", 5, ANSWER, "white", 0.8)
-END_MARK = _mark("o", 4, OTHERS, "white", 0.6)
-START_MARK = _mark("o", 4.5, "white", OTHERS, 1.0)
-MINIMUM_MARK = _mark("+", 9, INK, "white", 1.3, path_effects=[withStroke(linewidth=2.5, foreground=INK)])
+TRUTH_MARK = _mark("*", 14, style.TRUTH, style.INK, 0.8)
+CHOSEN_MARK = _mark("D", 5, style.ANSWER, "white", 0.8)
+END_MARK = _mark("o", 4, style.OTHERS, "white", 0.6)
+START_MARK = _mark("o", 4.5, "white", style.OTHERS, 1.0)
+MINIMUM_MARK = _mark("+", 9, style.INK, "white", 1.3, path_effects=[withStroke(linewidth=2.5, foreground=style.INK)])
 
 
 def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: float = 60.0) -> ScalarMappable | None:
@@ -51,9 +50,9 @@ def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: 
     what a colour bar of its relief or its arrows needs.
     """
     axes.set_title(content.title, pad=3)
-    axes.spines[:].set(color=FAINT)
-    degrees(axes, "x", 60)
-    degrees(axes, "y", 30)
+    axes.spines[:].set(color=style.FAINT)
+    style.degrees(axes.xaxis, 60)
+    style.degrees(axes.yaxis, 30)
     low, high, drawn = -limit, limit, None
     if content.density is not None:  # light below arrows
         _draw_ground(axes, content.density, RELIEF if content.arrows is None else style.DENSITY, Normalize(0, 1))
@@ -96,12 +95,10 @@ def _draw_ways(axes: Axes, ways: ShownPair, limit: float) -> None:
     for number, path in enumerate(() if ways.trajectories is None else np.rad2deg(ways.trajectories)):
         latitude, longitude = broken_at_seam(path[:, 0], path[:, 1])
         answer = number == ways.chosen
-        width = 1.5 if answer else 0.8
-        axes.plot(
-            longitude, latitude, color=ANSWER if answer else OTHERS, linewidth=width, solid_joinstyle="round",
-            path_effects=[withStroke(linewidth=width + 1.0, foreground="white")],
-            zorder=4 if answer else 3,
-        )  # fmt: skip
+        width, colour = (1.5, style.ANSWER) if answer else (0.8, style.OTHERS)
+        halo = [withStroke(linewidth=width + 1.0, foreground="white")]
+        look: dict[str, Any] = {"color": colour, "linewidth": width, "path_effects": halo, "zorder": 3 + answer}
+        axes.plot(longitude, latitude, solid_joinstyle="round", **look)
     if ways.starts is not None:
         _points(axes, ways.starts, limit, **START_MARK, zorder=5)
     _points(axes, ways.ends, limit, **END_MARK, zorder=5)
@@ -178,7 +175,7 @@ def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
     return [Line2D([], [], label=label, **mark) for shown, label, mark in entries if shown]
 
 
-@styled
+@style.styled
 def pair_figure(
     pair: ShownPair, maps: Sequence[PoseMap], title: str, note: str, views: Sequence[NDArray] = ()
 ) -> Figure:
@@ -191,7 +188,7 @@ def pair_figure(
     figure, body = style.page(8.0, 0.8 + max(4.0, high + below), title, note)
     left, right = body.subfigures(1, 2, width_ratios=[1.9, 6.1])
     for axes, name in zip(left.subplots(2, 1), ("reference", "query"), strict=True):
-        show_image(axes, getattr(pair, name).image, name)
+        style.show_image(axes, getattr(pair, name).image, name)
     upper, lower = right.subfigures(2, 1, height_ratios=[high, below]) if rows else (right, None)
     panels = upper.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
     for axes, each in zip(panels, maps, strict=True):
@@ -208,14 +205,14 @@ def pair_figure(
         lower.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
         places = lower.subplots(rows, min(len(views), 5), squeeze=False).flat
         for number, (image, words) in enumerate(zip(views, ends_in_words(pair), strict=True)):
-            frame: Any = {"color": ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
-            show_image(next(places), image, ": ".join(filter(None, words)), **frame)
+            frame: Any = {"color": style.ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
+            style.show_image(next(places), image, ": ".join(filter(None, words)), **frame)
         for axes in places:
             axes.remove()
     return figure
 
 
-@styled
+@style.styled
 def surface_figure(landscape: Landscape, truth: NDArray | None = None, title: str = "") -> Figure:
     """The landscape in 3-D over its own map; the true relative pose `[3]` (radians) is marked on both."""
     figure = Figure(figsize=(4.8, 3.6))
@@ -251,7 +248,7 @@ def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> 
     axes.set(xlim=(0, 360), ylim=(latitude[0], latitude[-1]), zlim=(floor, low + relief))
     if truth is not None:
         place = math.degrees(truth[1]) % 360, math.degrees(truth[0])
-        axes.plot(*([each, each] for each in place), [floor, low + relief], color=INK, linewidth=0.8, zorder=10)
+        axes.plot(*([each, each] for each in place), [floor, low + relief], color=style.INK, linewidth=0.8, zorder=10)
         axes.plot(*([each] for each in place), [floor], zorder=11, **TRUTH_MARK)
     axes.view_init(elev=32, azim=-62)
     axes.set_box_aspect((2.0, 1.15, 0.95), zoom=1.04)
@@ -267,7 +264,7 @@ def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> 
         if axis is not axes.zaxis:
             axis.set_major_formatter(StrMethodFormatter("{x:g}°"))
         axis.pane.set_visible(False)
-        axis._axinfo["grid"].update(color=FAINT, linewidth=0.4)
+        axis._axinfo["grid"].update(color=style.FAINT, linewidth=0.4)
 
 
 def ends_in_words(pair: ShownPair) -> list[tuple[str, str]]:
@@ -287,7 +284,7 @@ def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:
     return min(180.0, max(60.0, 15.0 * math.ceil((furthest + 2) / 15)))
 
 
-@styled
+@style.styled
 def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
     """A column a pair: reference and query above the surface of the prior's energy, whose height is its own range."""
     rows = -(-len(pairs) // COLUMNS)
@@ -296,16 +293,16 @@ def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
     for number, (part, pair) in enumerate(zip(places, pairs, strict=False)):
         panels = part.subplot_mosaic([["reference", "query"], ["surface", "surface"]], height_ratios=[1, 1.7],
                                      per_subplot_kw={"surface": {"projection": "3d"}})  # fmt: skip
-        show_image(panels["reference"], pair.reference.image, letter(number, pair.title))
-        show_image(panels["query"], pair.query.image)
-        panels["query"].set_title(minima_in_words(pair.prior_energy), loc="right", **ASIDE)
+        style.show_image(panels["reference"], pair.reference.image, style.letter(number, pair.title))
+        style.show_image(panels["query"], pair.query.image)
+        panels["query"].set_title(minima_in_words(pair.prior_energy), loc="right", **style.ASIDE)
         small_surface(panels["surface"], pair.prior_energy, pair.truth)
         panels["surface"].set_xlabel("longitude", fontsize=7, labelpad=-8)
         panels["surface"].set_ylabel("latitude", fontsize=7, labelpad=-8)
     return figure
 
 
-@styled
+@style.styled
 def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -> Figure:
     """(a), (b) both images; (c) a row a trajectory, of `views` `[N, K, H, W, 3]` at `steps`; (d) the landscape."""
     figure = Figure(figsize=(WIDTH, max(3.0, 0.4 + 0.65 * len(views))), layout="constrained")
@@ -315,14 +312,14 @@ def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -
     grid = middle.subplots(*views.shape[:2], squeeze=False)
     for number, (row, words) in enumerate(zip(grid, ends_in_words(pair), strict=True)):
         answer = number == pair.chosen
-        frame: Any = {"color": ANSWER, "linewidth": 1.2} if answer else {}
+        frame: Any = {"color": style.ANSWER, "linewidth": 1.2} if answer else {}
         for axes, image, step in zip(row, views[number], steps, strict=True):
-            show_image(axes, image, **frame)
+            style.show_image(axes, image, **frame)
             if number == 0:
-                axes.set_title(f"step {step}", loc="center", **ASIDE)
+                axes.set_title(f"step {step}", loc="center", **style.ASIDE)
         start, off = words
         row[0].set_ylabel(f"from {start}\n{off}", fontsize=7, rotation=0, ha="right", va="center",
-                          color=ANSWER if answer else INK)  # fmt: skip
+                          color=style.ANSWER if answer else style.INK)  # fmt: skip
     above, below = right.subfigures(2, 1, height_ratios=[1, 1.1])
     _small_map(above.subplots(), PoseMap("(d) landscape", relief=pair.prior_energy, ways=pair), pair.truth)
     small_surface(below.subplots(subplot_kw={"projection": "3d"}), pair.prior_energy, pair.truth)
@@ -337,7 +334,7 @@ class FailureRow(NamedTuple):
     generated: NDArray
 
 
-@styled
+@style.styled
 def failures_figure(rows: Sequence[FailureRow]) -> Figure:
     """A row a pair: reference above query, views evenly around, rendered above generated, the landscape."""
     figure = Figure(figsize=(WIDTH, 0.3 + 1.75 * len(rows)), layout="constrained")
@@ -352,9 +349,9 @@ def failures_figure(rows: Sequence[FailureRow]) -> Figure:
         for row, (name, views) in zip(grid, lines.items(), strict=True):
             row[0].set_ylabel(name, fontsize=7.5)
             for axes, image in zip(row, views, strict=True):
-                show_image(axes, image)
+                style.show_image(axes, image)
         for axes, place in zip(grid[0], range(count), strict=True):
-            axes.set_title(f"{360 * place / count:g}°", loc="center", **ASIDE)
+            axes.set_title(f"{360 * place / count:g}°", loc="center", **style.ASIDE)
         _small_map(right.subplots(), PoseMap(relief=pair.prior_energy), pair.truth, last=number == len(rows) - 1)
         if number == 0:
             titles = ("(a) pair", "(b) turned around the object", "(c) landscape")
@@ -363,7 +360,7 @@ def failures_figure(rows: Sequence[FailureRow]) -> Figure:
     return figure
 
 
-@styled
+@style.styled
 def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
     """(a) reference and query, then the pair's four maps and exp(-E) of two energies by title, in two rows."""
     figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
@@ -380,7 +377,7 @@ def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
     return figure
 
 
-@styled
+@style.styled
 def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figure:
     """A row a pair: reference above query, and its maps, their own titles small; `titles` are those of the columns."""
     figure = Figure(figsize=(WIDTH, 0.4 + 1.45 * len(pairs)), layout="constrained")
@@ -389,18 +386,18 @@ def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figu
               for row, both in enumerate(names) for name in both]  # fmt: skip
     panels = figure.subplot_mosaic(mosaic, width_ratios=[0.5, *[1.7] * len(titles)])
     for row, (pair, both) in enumerate(zip(pairs, names, strict=True)):
-        _draw_pair([panels[name] for name in both], pair, [letter(0, pair.title) if row == 0 else pair.title, ""])
+        _draw_pair([panels[name] for name in both], pair, [style.letter(0, pair.title) if row == 0 else pair.title, ""])
         for column, content in enumerate(pair.maps):
             axes, last = panels[f"map {row} {column}"], row == len(pairs) - 1
-            title = letter(column + 1, titles[column]) if row == 0 else ""
+            title = style.letter(column + 1, titles[column]) if row == 0 else ""
             _small_map(axes, content._replace(title=title), pair.truth, first=column == 0, last=last)
-            axes.set_title(content.title, loc="right", **ASIDE)
+            axes.set_title(content.title, loc="right", **style.ASIDE)
     return figure
 
 
 def _draw_pair(panels: Sequence[Axes], pair: ShownPair, titles: Sequence[str] = ("(a) reference", "(b) query")) -> None:
     for axes, view, title in zip(panels, (pair.reference, pair.query), titles, strict=True):
-        show_image(axes, view.image, title)
+        style.show_image(axes, view.image, title)
 
 
 def _small_map(axes: Axes, content: PoseMap, truth: NDArray | None, first: bool = True, last: bool = True) -> None:

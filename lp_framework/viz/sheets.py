@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lp_framework.viz.style import CLASS_COLOURS, TRUTH, class_keys, page, shortened, show_image, styled
+from lp_framework.viz import style
 
 MOST_OBJECTS = 42
 LARGEST = 1.6  # inches, a side of a view
@@ -26,7 +26,7 @@ class ObjectCard(NamedTuple):
     success: float | None
 
 
-@styled
+@style.styled
 def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
     """The objects, worst recall first (then worst success rate, then by name); at most the worst `MOST_OBJECTS`."""
     ranked = sorted(cards, key=lambda card: (card.recall, card.success or 0.0, card.name))
@@ -34,22 +34,22 @@ def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
     columns = min(len(shown), 4 if len(shown) <= 8 else 6 if len(shown) <= 18 else 7)
     rows, side = math.ceil(len(shown) / columns), min(8.0 / columns, LARGEST)
     fewer = f" (the {len(shown)} worst of {len(ranked)})" if len(shown) < len(ranked) else ""
-    figure, body = page(8.0, 0.6 + rows * (side + 0.45), f"Objects, worst first{fewer}")
+    figure, body = style.page(8.0, 0.6 + rows * (side + 0.45), f"Objects, worst first{fewer}")
     places = body.subplots(rows, columns, squeeze=False).flat
     for each in shown:
         axes = next(places)
-        name = shortened(each.name.replace("_", " "), 14.5 * side)
-        show_image(axes, each.image, name, color=CLASS_COLOURS[each.ambiguity], linewidth=1.6)
+        name = style.shortened(each.name.replace("_", " "), 14.5 * side)
+        style.show_image(axes, each.image, name, color=style.CLASS_COLOURS[each.ambiguity], linewidth=1.6)
         success = "" if each.success is None else f"\nSR(R)@30 {each.success:.2f}"
         axes.set_xlabel(f"R(R)@15 {each.recall:.2f}{success}", fontsize=7, loc="left")
     for axes in places:
         axes.remove()
-    keys = class_keys([each.ambiguity for each in shown])
+    keys = style.class_keys([each.ambiguity for each in shown])
     figure.legend(handles=keys, loc="outside lower right", ncols=len(keys))
     return figure
 
 
-@styled
+@style.styled
 def views_figure(
     source: NDArray, views: NDArray, latitudes_degrees: Sequence[float], longitudes_degrees: Sequence[float],
     title: str, note: str,
@@ -59,17 +59,17 @@ def views_figure(
     """
     rows, columns = views.shape[:2]
     side = min(7.3 / columns, LARGEST)
-    figure, body = page(2.6 + side * columns, 1.2 + max(1.9, side * rows), title, note)
+    figure, body = style.page(2.6 + side * columns, 1.2 + max(1.9, side * rows), title, note)
     figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)
     left, right = body.subfigures(1, 2, width_ratios=[2.0, 0.6 + side * columns])
-    show_image(left.subplots(), source, "source")
+    style.show_image(left.subplots(), source, "source")
     grid = right.subplots(rows, columns, squeeze=False)
     for row, latitude in zip(range(rows), latitudes_degrees, strict=True):
         grid[row, 0].set_ylabel(signed(latitude), rotation=0, ha="right", va="center")
         for column, longitude in zip(range(columns), longitudes_degrees, strict=True):
             own = math.isclose(latitude, 0) and math.isclose(longitude % 360, 0)
-            frame: Any = {"color": TRUTH, "linewidth": 1.6} if own else {"linewidth": 0.5}
-            show_image(grid[row, column], views[row, column], **frame)
+            frame: Any = {"color": style.TRUTH, "linewidth": 1.6} if own else {"linewidth": 0.5}
+            style.show_image(grid[row, column], views[row, column], **frame)
             grid[row, column].set_zorder(1 + own)
     for column in range(0, columns, -(-columns // MOST_LABELS)):
         grid[-1, column].set_xlabel(f"{longitudes_degrees[column]:.4g}°")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
@@ -65,14 +66,13 @@ def show_image(axes: Axes, image: NDArray | Image, title: str = "", **frame: Any
     axes.set_title(title, pad=3)
 
 
-def class_keys(classes: Sequence[str], **look: Any) -> list[Line2D]:
+def class_keys(classes: Sequence[str]) -> list[Line2D]:
     """The key's entries for those ambiguity classes that are among `classes`."""
-    return [Line2D([], [], color=CLASS_COLOURS[name], label=name, **look) for name in CLASS_COLOURS if name in classes]
+    return [Line2D([], [], color=colour, label=name) for name, colour in CLASS_COLOURS.items() if name in classes]
 
 
-def degrees(axes: Axes, which: Literal["x", "y"], step: float) -> None:
+def degrees(axis: Axis, step: float) -> None:
     """Ticks every `step` degrees on an axis, labelled with a degree sign."""
-    axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(MultipleLocator(step))
     axis.set_major_formatter(StrMethodFormatter("{x:g}°"))
 

@@ -3,25 +3,18 @@
 (() => {
   for (const table of document.querySelectorAll("table[data-sorts]")) {
     const heads = [...table.tHead.rows[0].cells];
-    heads.forEach((head, column) =>
-      head.firstElementChild.addEventListener("click", () => {
-        // Numbers begin with the largest, words with the first.
-        const [first, other] = head.classList.contains("number") ? ["descending", "ascending"] : ["ascending", "descending"];
-        const order = head.getAttribute("aria-sort") === first ? other : first;
-        for (const each of heads) each.setAttribute("aria-sort", each === head ? order : "none");
-        sortRows(table.tBodies[0], column, order === "ascending" ? 1 : -1);
-      }),
-    );
-  }
-
-  function sortRows(body, column, sign) {
-    const keys = new Map([...body.rows].map((row) => [row, sortKey(row.cells[column])]));
-    const compare = (a, b) => {
-      if (a === "" || b === "") return (a === "") - (b === ""); // what has no value is last either way
-      if (typeof a === "number" && typeof b === "number") return sign * (a - b);
-      return sign * String(a).localeCompare(String(b), undefined, { numeric: true });
-    };
-    body.append(...[...body.rows].sort((a, b) => compare(keys.get(a), keys.get(b))));
+    heads.forEach((head, column) => head.firstElementChild.addEventListener("click", () => {
+      // Numbers begin with the largest, words with the first.
+      const [first, other] = head.classList.contains("number") ? ["descending", "ascending"] : ["ascending", "descending"];
+      const order = head.getAttribute("aria-sort") === first ? other : first;
+      for (const each of heads) each.setAttribute("aria-sort", each === head ? order : "none");
+      const sign = order === "ascending" ? 1 : -1;
+      const sorted = [...table.tBodies[0].rows].map((row) => [sortKey(row.cells[column]), row]).sort(([a], [b]) => {
+        if (a === "" || b === "") return (a === "") - (b === ""); // what has no value is last either way
+        return sign * (typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true }));
+      });
+      table.tBodies[0].append(...sorted.map(([, row]) => row));
+    }));
   }
 
   // A number that the text begins with, else the text.
@@ -30,16 +23,6 @@
     const number = parseFloat(text);
     return Number.isNaN(number) || cell.classList.contains("word") ? text : number;
   }
-
-  function openRun() {
-    const run = location.hash && document.getElementById(location.hash.slice(1));
-    if (run instanceof HTMLDetailsElement) {
-      run.open = true;
-      run.scrollIntoView();
-    }
-  }
-  addEventListener("hashchange", openRun);
-  openRun();
 
   async function unpack(packed) {
     const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
@@ -130,23 +113,18 @@
     }
 
     function stop() {
-      cancelAnimationFrame(playing);
+      clearInterval(playing);
       playing = null;
       play.textContent = "Play";
     }
 
     function start() {
-      const from = Number(slider.value) === last ? 0 : Number(slider.value);
-      const began = performance.now();
-      const tick = (now) => {
-        const place = Math.min(last, from + Math.floor(((now - began) / 6000) * last)); // all of it takes six seconds
-        if (place !== Number(slider.value)) go(place);
-        if (place === last || stage.hidden) stop();
-        else playing = requestAnimationFrame(tick);
-      };
       play.textContent = "Pause";
-      go(from);
-      playing = requestAnimationFrame(tick);
+      go(Number(slider.value) % last);
+      playing = setInterval(() => {
+        go(Number(slider.value) + 1);
+        if (Number(slider.value) === last || stage.hidden) stop();
+      }, 6000 / last); // all of it takes six seconds
     }
 
     slider.addEventListener("input", () => { stop(); go(Number(slider.value)); });
