@@ -344,7 +344,7 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
         (["figure=toy", "figure.energy=score"], "figure.energy=score: holds no energy model"),
         (["figure=cameras", "figure.score=energy"], "figure.score=energy: holds no score model"),
         (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data have no object 'cap'; did you mean"),
-        (["figure=recall", "figure.runs=none"], "there is no such folder of finished runs; `python -m lp_framework ev"),
+        (["figure=recall", "figure.runs=none"], "runs=none: there is no such folder"),
         (["figure=recall", "figure.runs=score"], "no finished runs with several numbers of starts; `python -m lp_fr"),
         (
             ["figure=failures", "figure.objects=[cup]", "figure.timesteps=[1000]"],

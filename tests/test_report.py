@@ -115,14 +115,6 @@ def test_a_single_run_has_no_spread_and_an_infinite_median_stays_infinite(tmp_pa
     assert "inf" in layout(table).lines[0].cells
 
 
-def test_one_noise_written_in_two_ways_is_one_setting(tmp_path):
-    for seed, gamma in enumerate((0.3, [0.0, 0.3, 0.0], [0, 0.3, 0])):
-        write_result(tmp_path / str(seed), {"solver.gamma": gamma, "seed": seed})
-    (table,), _ = tables_of(tmp_path)
-    (row,) = table.rows
-    assert row.seeds == [0, 1, 2] and table.common["solver.gamma"] == 0.3
-
-
 @pytest.mark.parametrize("change", [{"data.name": "meshes"}, {"protocol": "per_view"}, {"data.path": "elsewhere"}])
 def test_other_data_or_another_protocol_is_another_row(tmp_path, change):
     write_result(tmp_path / "a", {"seed": 0})

@@ -176,7 +176,7 @@ def test_the_joint_solver_from_the_command_line(commands):
         -1
     ].rotation_errors[0]
     for example in examples:  # the answers of the sets, which are not those of the pairs by themselves
-        row = by_pair[example.object, example.reference.name, example.query.name]
+        row = by_pair[example.object, example.reference.file.name, example.query.file.name]
         assert float(row["longitude_degrees"]) == pytest.approx(math.degrees(example.ends[0, 1]), abs=0.02)
         assert example.trajectories is None and len(example.ends) == 1
     page = (ran.folder / "report.html").read_text()

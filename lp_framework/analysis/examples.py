@@ -36,7 +36,6 @@ from lp_framework.analysis.pairs import (
 )
 from lp_framework.data.pairs import PairData
 from lp_framework.data.photographs import save_png
-from lp_framework.errors import UserError
 from lp_framework.evaluation.evaluation import Evaluation
 from lp_framework.evaluation.tables import write_text
 from lp_framework.models.pose_model import PoseModel
@@ -147,23 +146,19 @@ def save_examples(folder: Path, examples: Sequence[ShownPair]) -> None:
 
 
 def read_examples(folder: Path) -> list[ShownPair]:
-    """The examples in `folder`; `UserError` where they are missing or damaged."""
-    file = folder / FILE
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        return [_example(folder, number, entry) for number, entry in enumerate(content["examples"])]
-    except FileNotFoundError as error:
-        raise UserError(f"{error.filename}: there is no such file") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        raise UserError(f"{file}: is damaged ({type(error).__name__}: {error})") from error
+    """The examples in `folder`; what is missing or damaged raises as `open`, `json` and Pillow do."""
+    content = json.loads((folder / FILE).read_text(encoding="utf-8"))
+    return [_example(folder, number, entry) for number, entry in enumerate(content["examples"])]
 
 
 def as_json(example: ShownPair) -> dict[str, Any]:
     """All of an example but pixels and maps, as names, lists and numbers (null for what is not finite)."""
     return {
         **{name: getattr(example, name) for name in ("object", "ambiguity", "reason")},
-        "reference": _view_as_json(example.reference),
-        "query": _view_as_json(example.query),
+        **{
+            side: {"file": view.file.name, "pose": _numbers(view.pose), "field_of_view": view.field_of_view}
+            for side, view in (("reference", example.reference), ("query", example.query))
+        },
         **{name: _numbers(getattr(example, name)) for name in ARRAYS},
         "chosen": example.chosen or 0,
         "landscapes": [
@@ -177,10 +172,6 @@ def as_json(example: ShownPair) -> dict[str, Any]:
     }
 
 
-def _view_as_json(view: View) -> dict[str, Any]:
-    return {"file": view.name, "pose": _numbers(view.pose), "field_of_view": view.field_of_view}
-
-
 def _example(folder: Path, number: int, entry: Mapping[str, Any]) -> ShownPair:
     def view(name: str) -> View:
         with Image.open(folder / f"{number}_{name}.png") as image:
@@ -191,15 +182,13 @@ def _example(folder: Path, number: int, entry: Mapping[str, Any]) -> ShownPair:
         )
 
     values: dict[str, Any] = {name: _array(entry[name]) for name in ARRAYS if entry[name] is not None}
-    if not 0 <= (chosen := int(entry["chosen"])) < len(values["ends"]):
-        raise ValueError(f"chosen is {chosen} of {len(values['ends'])}")
     landscapes = {}
     for each in entry["landscapes"]:
         grid = {part: torch.from_numpy(_array(each[part])) for part in ("latitude", "longitude", "energy")}
         landscapes[str(each["name"])] = Landscape(radius=float(each["radius"]), **grid)
     values |= {name: str(entry[name]) for name in ("object", "ambiguity", "reason")}
     values |= {name: view(name) for name in ("reference", "query")}
-    return ShownPair(chosen=chosen, landscapes=landscapes, **values)
+    return ShownPair(chosen=int(entry["chosen"]), landscapes=landscapes, **values)
 
 
 def _numbers(values: NDArray | None) -> Any:

@@ -44,11 +44,6 @@ class View:
     pose: NDArray
     field_of_view: float = math.radians(FIELD_OF_VIEW_DEGREES)
 
-    @property
-    def name(self) -> str:
-        """The file's name."""
-        return self.file.name
-
 
 @dataclass(frozen=True)
 class ShownPair:

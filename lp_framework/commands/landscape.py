@@ -130,7 +130,7 @@ def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownP
     pairs = view_set(prepared, device).pairs([0], [1])
     pose = np.array([0.0, 0.0, 1.4])
     reference, query = (View(file, on_white(image), pose) for file, image in zip(files, prepared, strict=True))
-    return pairs, ShownPair(f"{reference.name} and {query.name}", "unlabelled", "", reference, query)
+    return pairs, ShownPair(f"{reference.file.name} and {query.file.name}", "unlabelled", "", reference, query)
 
 
 def landscape_arrays(pair: ShownPair, field: FieldValue | None) -> dict[str, Any]:

@@ -39,7 +39,6 @@ from lp_framework.viz.style import CLASS_COLOURS
 
 PAGE = "report.html"
 LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of the runs are in the table alone
-MOST_CAMERAS = 40
 WORST = 20  # pairs in the table of the worst
 TRAINING, LANDSCAPE, OVERVIEW = "training.json", "landscape.json", "azimuth.json"
 POSE = ("latitude_degrees", "longitude_degrees", "radius")
@@ -302,12 +301,11 @@ def _cameras(folder: Path) -> dict[str, Any]:
     rows = [row for row in read_rows(folder / "poses.csv") if row["valid"] == "True"]
     if not rows:
         raise UserError("no photograph has a pose")
-    shown = rows[:MOST_CAMERAS]
-    poses = np.array([[float(row[key]) for key in POSE] for row in shown])
+    poses = np.array([[float(row[key]) for key in POSE] for row in rows])
     poses[:, :2] = np.radians(poses[:, :2])
     field_of_view = float(read_record(folder / "transforms.json")["camera_angle_x"])
-    figure = plots.cameras_plot(poses, _images(folder, shown), field_of_view)
-    return {"figure": figure, "shown": len(shown), "count": len(rows)}
+    figure = plots.cameras_plot(poses, _images(folder, rows), field_of_view)
+    return {"figure": figure}
 
 
 def _poses(folder: Path) -> dict[str, Any]:

@@ -44,7 +44,6 @@ LOOK = {
 }  # fmt: skip
 PLACE = "longitude %{x:.1f}°, latitude %{y:.1f}°"
 FRAMES = 40  # of a pair, at most
-ERROR_POINTS, LOSS_POINTS = 400, 2000  # of a curve
 PIXELS = 32  # a side of an image in space
 GLOBE = 0.42  # object sizes, the radius
 OUTLINE = [0, 1, 2, 3, 0, 4, 1, 2, 4, 3]  # all edges of a frustum in one line
@@ -67,9 +66,8 @@ def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
         figure.add_vline(math.sqrt(threshold), line={"color": MUTED, "width": 1, "dash": "dot"})
     for name, values in errors.items():
         error, share = cumulative(values, 180.0)
-        kept = np.unique(np.linspace(0, len(error) - 1, ERROR_POINTS).round().astype(int))
         figure.add_scatter(
-            x=_numbers(np.sqrt(error[kept])), y=_numbers(share[kept]), customdata=_numbers(error[kept]),
+            x=_numbers(np.sqrt(error)), y=_numbers(share), customdata=_numbers(error),
             name=f"{name} ({len(values)} pairs)", mode="lines",
             line={"color": f"var(--{name})", "width": 2.5, "shape": "hv"},
             hovertemplate="%{y:.1%} of pairs within %{customdata:.1f}°<extra>%{fullData.name}</extra>",
@@ -91,13 +89,13 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
         line = {"color": colour, "width": 2}
         if (window := len(curve.step) // 20) > 1:
             pale = {"marker": {"color": colour, "size": 3}, "opacity": 0.3, "hoverinfo": "skip", "showlegend": False}
-            figure.add_scatter(**_thinned(curve), mode="markers", **pale)
+            figure.add_scatter(**_losses(curve), mode="markers", **pale)
             curve = Curve(curve.step, running_mean(curve.value, window))
         mode = "lines" if len(curve.step) > 30 else "lines+markers"
-        figure.add_scatter(**_thinned(curve), name=LOSSES[name][1], mode=mode, line=line)
+        figure.add_scatter(**_losses(curve), name=LOSSES[name][1], mode=mode, line=line)
     if rate is not None:
         line = {"color": INK, "width": 1.5}
-        figure.add_scatter(**_thinned(rate), yaxis="y2", name="learning rate", mode="lines", line=line)
+        figure.add_scatter(**_losses(rate), yaxis="y2", name="learning rate", mode="lines", line=line)
     return figure
 
 
@@ -401,10 +399,8 @@ def _xyz(points: NDArray) -> dict[str, list[float]]:
     return {name: _numbers(values) for name, values in zip("xyz", points.T, strict=False)}
 
 
-def _thinned(curve: Curve) -> dict[str, list[float]]:
-    """A curve with at most `LOSS_POINTS` points, to five digits."""
-    every = -(-len(curve.step) // LOSS_POINTS)
-    return {"x": curve.step[::every].tolist(), "y": [float(f"{value:.5g}") for value in curve.value[::every]]}
+def _losses(curve: Curve) -> dict[str, list[float]]:
+    return {"x": curve.step.tolist(), "y": curve.value.tolist()}
 
 
 def _numbers(values: NDArray) -> Any:

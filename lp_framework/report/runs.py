@@ -119,15 +119,11 @@ def read_run(folder: Path) -> Run:
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """What was set, by dotted keys: without seeds, plugin folders and the checkpoint; whole numbers as int.
 
-    >>> settings({"seed": 1, "data": {"name": "toy", "seed": 1}, "solver": {"gamma": [0.0, 0.3, 0.0]}})
+    >>> settings({"seed": 1, "data": {"name": "toy", "seed": 1}, "solver": {"gamma": 0.3}})
     {'data.name': 'toy', 'solver.gamma': 0.3}
     """
     values = {key: _number(value) for key, value in dotted(config).items() if key not in ASIDE}
-    values = {key: value for key, value in values.items() if not key.endswith(".seed")}
-    for key, value in values.items():
-        if key.endswith(".gamma") and isinstance(value, list) and len(value) == 3 and value[0] == value[2] == 0:
-            values[key] = value[1]  # [0, g, 0] is the noise g
-    return values
+    return {key: value for key, value in values.items() if not key.endswith(".seed")}
 
 
 def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:

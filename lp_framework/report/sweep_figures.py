@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
@@ -35,6 +33,7 @@ SECONDS, SOLVER = "seconds_per_pair", "solver.name"
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = (0, (3, 2))  # of the paper's curves
+PAPER = "the paper: other data, other prior"
 PLACE = ("data.name", "protocol", "checkpoint", "prior.name", "solver.name", "start.name", "views")  # of all runs
 
 
@@ -98,8 +97,7 @@ def cost_figure(table: SweepTable) -> Figure | None:
 def curves_figure(panels: Sequence[Panel]) -> Figure:
     """Panels side by side on one axis of shares; the paper's curves are dashed, with hollow marks."""
     figure, row = _side_by_side(len(panels), 3.3)
-    drawn = [curve for panel in panels for curve in panel.curves]
-    labels = list(dict.fromkeys(curve.label for curve in drawn))
+    labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     for axes, panel in zip(row, panels, strict=True):
         for curve in panel.curves:
             place, theirs = labels.index(curve.label) % len(COLOURS), curve.paper
@@ -107,15 +105,20 @@ def curves_figure(panels: Sequence[Panel]) -> Figure:
                 curve.x, curve.mean, yerr=None if theirs else curve.std, color=COLOURS[place], marker=MARKERS[place],
                 markersize=4.5, markerfacecolor="white" if theirs else COLOURS[place], capsize=2, elinewidth=1.0,
                 linestyle=DASHES if theirs else "-", linewidth=1.0 if theirs else 1.5, clip_on=False,
-                zorder=2 if theirs else 3,
+                zorder=2 if theirs else 3, label=PAPER if theirs else curve.label,
             )  # fmt: skip
-        _across(axes, panel)
+        axes.set_xlabel(panel.xlabel)
+        if panel.logarithmic:
+            axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        else:
+            axes.set_xticks(sorted({float(x) for curve in panel.curves for x in curve.x}))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.set_title(panel.title)
         open_frame(axes)
-    values = np.concatenate([[*curve.mean, *(curve.mean - np.nan_to_num(curve.std))] for curve in drawn])
-    row[0].set_ylim(_lowest(values, 0.2), 1.0)
+    row[0].set_ylim(top=1.0)
     row[0].set_ylabel("share of pairs")
-    _legend(figure, labels, any(curve.paper for curve in drawn), markersize=4.5, linestyle=DASHES)
+    _legend(figure)
     return figure
 
 
@@ -123,28 +126,25 @@ def curves_figure(panels: Sequence[Panel]) -> Figure:
 def rows_figure(rows: Mapping[str, Row]) -> Figure:
     """A line a row, from the top, by its label, in panels of metrics: a mark a metric at its share."""
     figure, panels = _side_by_side(len(PANELS), 1.15 + 0.27 * len(rows), sharex=True)
-    drawn = []
     for axes, (title, names) in zip(panels, PANELS.items(), strict=True):
-        for place, metric in enumerate(names):
+        for metric, within, colour, marker in zip(names, WITHIN, COLOURS, MARKERS, strict=False):
             for line, row in enumerate(rows.values()):
                 if metric in row.metrics:
-                    value = row.metrics[metric]
-                    drawn.append(value.mean)
                     axes.errorbar(
-                        value.mean, line, xerr=value.std, color=COLOURS[place], marker=MARKERS[place], markersize=5,
-                        linestyle="none", elinewidth=1.2, capsize=2, clip_on=False, zorder=3,
-                        markerfacecolor="white" if row.paper else COLOURS[place],
+                        row.metrics[metric].mean, line, xerr=row.metrics[metric].std, color=colour, marker=marker,
+                        markersize=5, linestyle="none", elinewidth=1.2, capsize=2, clip_on=False, zorder=3,
+                        markerfacecolor="white" if row.paper else colour, label=PAPER if row.paper else within,
                     )  # fmt: skip
         axes.set_title(title)
         axes.set_xlabel("share")
         open_frame(axes)
         axes.grid(visible=False, axis="x")
-    panels[0].set_xlim(_lowest(drawn, 0.3), 1.0)
+    panels[0].set_xlim(right=1.0)
     panels[0].set_yticks(range(len(rows)), list(rows))
     panels[0].set_ylim(len(rows) - 0.5, -0.5)
     for tick, row in zip(panels[0].get_yticklabels(), rows.values(), strict=True):
         tick.set_color(MUTED if row.paper else INK)
-    _legend(figure, WITHIN, any(row.paper for row in rows.values()), markersize=5, linestyle="none")
+    _legend(figure)
     return figure
 
 
@@ -212,37 +212,10 @@ def _side_by_side(panels: int, height: float, sharex: bool = False) -> tuple[Fig
     return figure, figure.subplots(1, panels, sharex=sharex, sharey=True, squeeze=False)[0]
 
 
-def _legend(figure: Figure, labels: Sequence[str], paper: bool, markersize: float, linestyle: Any) -> None:
+def _legend(figure: Figure) -> None:
     """Above the panels, in as many columns as fit: about 120 letters, and each key's mark takes the room of 9."""
-    keys = [
-        Line2D([], [], color=colour, marker=marker, label=label, markersize=markersize,
-               linestyle="none" if linestyle == "none" else "-")
-        for label, colour, marker in zip(labels, itertools.cycle(COLOURS), itertools.cycle(MARKERS), strict=False)
-    ]  # fmt: skip
-    if paper:
-        look: dict[str, Any] = {"marker": "o", "markersize": markersize, "markerfacecolor": "white"}
-        told = "the paper: other data, other prior"
-        keys.append(Line2D([], [], color=MUTED, label=told, linewidth=1.0, linestyle=linestyle, **look))
-    longest = max(len(str(key.get_label())) for key in keys) + 9
-    columns = max(1, min(len(keys), 120 // longest))
-    figure.legend(handles=keys, loc="outside upper left", ncols=columns, columnspacing=1.6)
-
-
-def _across(axes: Axes, panel: Panel) -> None:
-    """The horizontal axis: a tick for every value that was swept, or a logarithmic one."""
-    axes.set_xlabel(panel.xlabel)
-    if panel.logarithmic:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(10, subs=(1.0,), numticks=8))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    else:
-        axes.xaxis.set_major_locator(FixedLocator(sorted({float(x) for curve in panel.curves for x in curve.x})))
-        axes.xaxis.set_minor_locator(NullLocator())
-    axes.margins(x=0.08 if panel.logarithmic else 0.04)
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-
-
-def _lowest(shares: Iterable[float], room: float) -> float:
-    """Where an axis of shares begins: at a tenth, `room` tenths or more below the least of them, at most at 0.8."""
-    least = min((share for share in shares if math.isfinite(share)), default=0.0)
-    return min(0.8, max(0.0, math.floor(10 * least - room) / 10))
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    keys = dict(sorted(zip(labels, handles, strict=True), key=lambda key: key[0] == PAPER))  # last
+    if keys:
+        columns = max(1, min(len(keys), 120 // (max(map(len, keys)) + 9)))
+        figure.legend(keys.values(), keys.keys(), loc="outside upper left", ncols=columns, columnspacing=1.6)
