@@ -392,7 +392,7 @@ def test_runs_are_known_by_their_command_or_by_their_files(tmp_path):
 def test_a_set_of_runs_has_each_of_them_to_be_opened(tmp_path):
     runs = [(write_evaluation(tmp_path / f"e{seed}", seed), "eval") for seed in range(2)]
     runs.append((write_training(tmp_path / "t"), "train"))
-    page = Page(write_report_page(tmp_path / "report.html", runs, []))
+    page = Page(write_report_page(tmp_path / "report.html", runs, {}))
     opened = {each["id"] for _, each in page.elements if (each.get("id") or "").startswith("run-")}
     links = {each["href"].removeprefix("#") for tag, each in page.elements if tag == "a"}
     assert opened == links and len(opened) == 3
@@ -400,9 +400,9 @@ def test_a_set_of_runs_has_each_of_them_to_be_opened(tmp_path):
 
 def test_runs_that_would_make_the_page_too_large_are_in_the_table_alone(tmp_path, monkeypatch):
     runs = [(write_evaluation(tmp_path / f"e{seed}", seed), "eval") for seed in range(3)]
-    sizes = [len(Page(write_report_page(tmp_path / "one.html", runs[:1], [])).text)]
+    sizes = [len(Page(write_report_page(tmp_path / "one.html", runs[:1], {})).text)]
     monkeypatch.setattr(page_module, "LARGEST", sizes[0] - 2_000_000)  # without plotly.js: room for one
-    page = Page(write_report_page(tmp_path / "report.html", runs, []))
+    page = Page(write_report_page(tmp_path / "report.html", runs, {}))
     left_out = 3 - sum(tag == "details" and each.get("class") == "run" for tag, each in page.elements)
     assert left_out >= 1 and f"{left_out} runs would make this page too large" in page.said
     assert all(str(folder) in page.said for folder, _ in runs)
@@ -604,7 +604,7 @@ def test_a_table_sorts_by_click_and_by_keyboard(opened, tmp_path):
 @with_browser
 def test_a_run_of_a_set_opens_from_the_table(opened, tmp_path):
     runs = [(write_evaluation(tmp_path / f"e{seed}", seed), "eval") for seed in range(2)]
-    page = opened(write_report_page(tmp_path / "report.html", runs, []), "light", 390)
+    page = opened(write_report_page(tmp_path / "report.html", runs, {}), "light", 390)
     assert not page.locator(".card").first.is_visible()
     page.locator("a[href='#run-1']").click()
     page.locator("details[open] .card").first.wait_for(state="visible")

@@ -435,7 +435,7 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
             next(
                 view
                 for view in data.table.views_of(data.table.names.index(pair.object))
-                if data.table.files[view].name == each.name
+                if data.table.files[view].name == each.file.name
             )
             for each in (pair.reference, pair.query)
         ]

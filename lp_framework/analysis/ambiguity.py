@@ -17,8 +17,7 @@ from torch import Tensor
 from lp_framework.analysis.fields import Draws, pose_energies, prior_landscapes
 from lp_framework.analysis.landscapes import FLAT, Grid, Landscape, valleys
 from lp_framework.data.cache import tracked
-from lp_framework.data.module import EVALUATION_PAIRS, PairDataModule
-from lp_framework.data.pairs import in_batches
+from lp_framework.data.module import PairDataModule
 from lp_framework.geometry import wrap_angle
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, pairs_of
@@ -133,13 +132,9 @@ def overview(
     every, per_view = (table.pairs(each, draws.seed) for each in (protocol, "per_view"))
     rows: list[dict[str, Any]] = []
     for number in tracked(range(len(table.names)), "energies around the objects"):
-        energies, truth = [], []
-        for some in in_batches(every[np.isin(every[:, 0], table.views_of(number))], EVALUATION_PAIRS):
-            batch = views[some]
-            truth.append(batch.relative_poses())
-            around = azimuth_energies(prior, pairs_of(batch, device), truth[-1].to(device), places, draws)
-            energies.append(around.cpu())
-        energy, true = torch.cat(energies), torch.cat(truth)
+        batch = views[every[np.isin(every[:, 0], table.views_of(number))]]
+        true = batch.relative_poses()
+        energy = azimuth_energies(prior, pairs_of(batch, device), true.to(device), places, draws).cpu()
         curve, near = profile(energy, places, true[:, 1]), within(energy, places, true[:, 1])
         batch = views[per_view[table.views_of(number)[:PAIRS]]]  # a row a view
         true = batch.relative_poses()

@@ -77,7 +77,9 @@ def answers(solution: Solution | None) -> list[Answer]:
     for poses, shares, first in zip(
         solution.poses.detach().cpu(), solution.probability.detach().cpu(), solution.chosen.tolist(), strict=True
     ):
-        apart = _away(poses, poses[first]) > math.radians(2 * NEAR_DEGREES)
+        # The angles of latitude and longitude together, which those of the rotations do not exceed.
+        angles = torch.hypot(poses[:, 0] - poses[first, 0], wrap_angle(poses[:, 1] - poses[first, 1]))
+        apart = angles > math.radians(2 * NEAR_DEGREES)
         other = int(shares.masked_fill(~apart, -1.0).nan_to_num(nan=-1.0).argmax())
         second = _answer(poses[other], shares[other]) if apart[other] and shares[other] >= WORTH_TELLING else None
         found.append(_answer(poses[first], shares[first])._replace(second=second))
@@ -119,11 +121,6 @@ def in_words(latitude: float, longitude: float) -> str:
 
 def _answer(pose: Tensor, probability: Tensor) -> Answer:
     return Answer(pose[0].item(), pose[1].item(), probability.item())
-
-
-def _away(poses: Tensor, pose: Tensor) -> Tensor:
-    """Angles `[N]`, which those of the rotations do not exceed, between poses `[N, 3]` and one."""
-    return ((poses[:, 0] - pose[0]).square() + wrap_angle(poses[:, 1] - pose[1]).square()).sqrt()
 
 
 def _turn(longitude: float) -> float:

@@ -141,7 +141,7 @@ def save_examples(folder: Path, examples: Sequence[ShownPair]) -> None:
             image = Image.fromarray(view.image)
             image.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
             save_png(folder / f"{number}_{name}.png", image)
-    content = {"about": ABOUT, "examples": [as_json(example) for example in examples]}
+    content = {"about": ABOUT, "examples": [_record(example) for example in examples]}
     write_text(folder / FILE, json.dumps(content) + "\n")
 
 
@@ -151,8 +151,7 @@ def read_examples(folder: Path) -> list[ShownPair]:
     return [_example(folder, number, entry) for number, entry in enumerate(content["examples"])]
 
 
-def as_json(example: ShownPair) -> dict[str, Any]:
-    """All of an example but pixels and maps, as names, lists and numbers (null for what is not finite)."""
+def _record(example: ShownPair) -> dict[str, Any]:
     return {
         **{name: getattr(example, name) for name in ("object", "ambiguity", "reason")},
         **{

@@ -14,7 +14,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,20 +50,13 @@ HEADINGS = dict(zip([*ERRORS, *COSTS], ["Rot. (deg)", "Trans.", "s/pair", "passe
 About = tuple[str, str, Mapping[str, str]]  # title, subtitle, and the most important numbers by name
 
 
-class Section(NamedTuple):
-    """A part of a page under its heading; the content is HTML."""
-
-    title: str
-    content: str
-
-
 class RunPart(NamedTuple):
-    """A run on a page: what it is in a few words, its most important numbers by name, and its sections."""
+    """A run on a page: what it is in a few words, its most important numbers by name, its sections (HTML) by title."""
 
     title: str
     subtitle: str
     numbers: Mapping[str, str]
-    sections: Sequence[Section]
+    sections: Mapping[str, str]
 
 
 class Contents(NamedTuple):
@@ -83,14 +76,13 @@ def run_part(folder: Path, contents: Contents) -> RunPart:
         about = contents.about(folder)
     except BROKEN as error:
         about = folder.name, f"run without results: {reason(error)}", {}
-    sections = []
+    sections = {}
     configuration = {"Configuration and versions": ("configuration", partial(_configuration, contents.file))}
     for title, (template, values) in {**contents.sections, **configuration}.items():
         try:
-            content = render(f"{template}.html.j2", **values(folder))
+            sections[title] = render(f"{template}.html.j2", **values(folder))
         except BROKEN as error:
-            content = render("note.html.j2", text=f"Not shown: {reason(error)}.")
-        sections.append(Section(title, content))
+            sections[title] = render("note.html.j2", text=f"Not shown: {reason(error)}.")
     return RunPart(*about, sections)
 
 
@@ -164,37 +156,31 @@ def metric(metrics: Mapping[str, float | None], key: str) -> str:
 
 def write_run_page(folder: Path, kind: Kind) -> Path:
     """Write `report.html` into the folder of a finished run, from what is there."""
-    return write_report_page(folder / PAGE, [(folder, kind)], [])
+    return write_report_page(folder / PAGE, [(folder, kind)], {})
 
 
-def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Sequence[Section]) -> Path:
+def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Mapping[str, str]) -> Path:
     """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened."""
     if len(runs) == 1:
         part = run_part(runs[0][0], contents_of(*runs[0]))
-        *sections, configuration = part.sections
-        part = part._replace(sections=[*sections, *above, configuration])
+        *sections, configuration = part.sections.items()
+        part = part._replace(sections=dict([*sections, *above.items(), configuration]))
     else:
-        part = RunPart("Report", f"{len(runs)} runs", {}, [*above, *_sections_of_several(runs)])
+        part = RunPart("Report", f"{len(runs)} runs", {}, {**above, **_sections_of_several(runs)})
     templates = resources.files("lp_framework.report") / "templates"
     text = render(
         "page.html.j2",
         part=part,
         style=(templates / "page.css").read_text(encoding="utf-8"),
         script=(templates / "page.js").read_text(encoding="utf-8"),
-        plotly=_plotly() if any("data-figure=" in section.content for section in part.sections) else "",
+        plotly=packed(get_plotlyjs()) if any("data-figure=" in content for content in part.sections.values()) else "",
         version=importlib.metadata.version("lp_framework"),
     )
     write_text(path, text)
     return path
 
 
-@cache
-def _plotly() -> str:
-    """plotly.js, packed: a third of its size, so that every run of a sweep can have a page."""
-    return packed(get_plotlyjs())
-
-
-def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> list[Section]:
+def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> dict[str, str]:
     """A table for the runs of each command, and all that each of them shows, while there is room."""
     listed: list[dict[str, Any]] = []
     room = LARGEST
@@ -206,11 +192,11 @@ def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> list[Section]:
         room -= len(content) if fits else 0
         run = {"number": number, "folder": folder, "part": part, "content": content if fits else None}
         listed.append({"heading": contents.heading, **run})
-    sections = []
+    sections = {}
     for heading in dict.fromkeys(run["heading"] for run in listed):
         some = [run for run in listed if run["heading"] == heading]
-        sections.append(Section(heading, render("runs.html.j2", caption=heading, runs=some)))
-    return [*sections, Section("Run by run", render("opened.html.j2", runs=listed))]
+        sections[heading] = render("runs.html.j2", caption=heading, runs=some)
+    return {**sections, "Run by run": render("opened.html.j2", runs=listed)}
 
 
 def _about_evaluation(folder: Path) -> About:
@@ -229,11 +215,6 @@ def _about_evaluation(folder: Path) -> About:
             "seconds a pair": f"{result['seconds_per_pair']:.3g}",
         },
     )
-
-
-def _summary(folder: Path) -> dict[str, Any]:
-    result = read_record(folder / RESULT)
-    return {"rows": summary_rows(result), "unanswered": result.get("unanswered")}
 
 
 def _pairs(folder: Path) -> dict[str, Any]:
@@ -340,10 +321,6 @@ def _about_landscape(folder: Path) -> About:
     return title, "the energy of the prior over the relative pose of a pair, and the ways of a solver over it", numbers
 
 
-def _sheets(folder: Path) -> dict[str, Any]:
-    return {"files": [folder / "landscape.png", *folder.glob("fields.png")]}  # photographs have no fields
-
-
 def _about_azimuths(folder: Path) -> About:
     record = read_record(folder / OVERVIEW)
     names = {"within": "least energy within 15°, all objects", "within_unique_answer": "the same, unique answer"}
@@ -356,14 +333,17 @@ def _about_azimuths(folder: Path) -> About:
 
 CONTENTS: Mapping[str, Contents] = {
     "eval": Contents("Evaluations", RESULT, _about_evaluation, {
-        "Summary": ("summary", _summary), "Pairs, failures first": ("pairs", _pairs),
+        "Summary": ("summary", lambda folder: {"result": read_record(folder / RESULT)}),
+        "Pairs, failures first": ("pairs", _pairs),
         "Objects": ("objects", _objects), "Errors": ("errors", _errors)}),
     "train": Contents("Trainings", TRAINING, _about_training, {
         "Losses": ("losses", _losses), "Last values": ("last", lambda folder: read_record(folder / TRAINING))}),
     "estimate": Contents("Estimates", RESULT, _about_estimate, {
         "Cameras": ("cameras", _cameras), "Poses": ("poses", _poses)}),
     "landscape": Contents("Landscapes", LANDSCAPE, _about_landscape, {
-        "Landscape": ("pairs", _pairs), "Pictures": ("pictures", _sheets)}),
+        "Landscape": ("pairs", _pairs),
+        "Pictures": ("pictures", lambda folder: {  # photographs have no fields
+            "files": [folder / "landscape.png", *folder.glob("fields.png")]})}),
     "overview": Contents("Landscapes", OVERVIEW, _about_azimuths, {
         "Objects": ("azimuths", lambda folder: read_record(folder / OVERVIEW))}),
 }  # fmt: skip
@@ -381,10 +361,8 @@ _ENVIRONMENT = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters |= {
-    "metric": metric, "name": lambda path: Path(path).name, "packed": packed, "picture": picture, "sheet": sheet,
-    "words": words,
-}  # fmt: skip
+_ENVIRONMENT.filters |= {each.__name__: each for each in (metric, packed, picture, sheet, summary_rows, words)}
+_ENVIRONMENT.filters["name"] = lambda path: Path(path).name
 _ENVIRONMENT.tests |= {"finite": math.isfinite}
 _ENVIRONMENT.globals |= {
     "classes": list(CLASS_COLOURS),

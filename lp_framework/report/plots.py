@@ -89,13 +89,13 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
         line = {"color": colour, "width": 2}
         if (window := len(curve.step) // 20) > 1:
             pale = {"marker": {"color": colour, "size": 3}, "opacity": 0.3, "hoverinfo": "skip", "showlegend": False}
-            figure.add_scatter(**_losses(curve), mode="markers", **pale)
+            figure.add_scatter(**_curve(curve), mode="markers", **pale)
             curve = Curve(curve.step, running_mean(curve.value, window))
         mode = "lines" if len(curve.step) > 30 else "lines+markers"
-        figure.add_scatter(**_losses(curve), name=LOSSES[name][1], mode=mode, line=line)
+        figure.add_scatter(**_curve(curve), name=LOSSES[name][1], mode=mode, line=line)
     if rate is not None:
         line = {"color": INK, "width": 1.5}
-        figure.add_scatter(**_losses(rate), yaxis="y2", name="learning rate", mode="lines", line=line)
+        figure.add_scatter(**_curve(rate), yaxis="y2", name="learning rate", mode="lines", line=line)
     return figure
 
 
@@ -399,7 +399,7 @@ def _xyz(points: NDArray) -> dict[str, list[float]]:
     return {name: _numbers(values) for name, values in zip("xyz", points.T, strict=False)}
 
 
-def _losses(curve: Curve) -> dict[str, list[float]]:
+def _curve(curve: Curve) -> dict[str, list[float]]:
     return {"x": curve.step.tolist(), "y": curve.value.tolist()}
 
 

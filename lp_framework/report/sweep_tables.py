@@ -16,7 +16,7 @@ from rich.table import Table
 
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.evaluation.tables import COLUMNS, ERRORS, write_csv, write_json, write_text
-from lp_framework.report.page import HEADINGS, Section, number, render
+from lp_framework.report.page import HEADINGS, number, render
 from lp_framework.report.paper import PaperTable, paper_table
 from lp_framework.report.runs import COSTS, LeftOut, Run, checkpoint_names
 
@@ -122,8 +122,14 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     def told_apart(keys: Sequence[str]) -> int:
         return len({json.dumps({key: each[key] for key in keys if key in each}) for each in settings})
 
+    def said_by_choice(key: str) -> bool:
+        choice = f"{key.rpartition('.')[0]}.name"
+        names = {each.get(choice) for each in settings if key in each}
+        groups = [[each for each in settings if each.get(choice) == name] for name in names]
+        return key != choice and len(names) > 1 and all(len(_values(group, key)) == 1 for group in groups)
+
     keys = list(dict.fromkeys(key for each in settings for key in each))
-    chosen = [key for key in keys if len(_values(settings, key)) > 1 and not _said_by_choice(settings, key)]
+    chosen = [key for key in keys if len(_values(settings, key)) > 1 and not said_by_choice(key)]
     for key in keys:
         if told_apart([*chosen, key]) > told_apart(chosen):
             chosen.append(key)
@@ -191,27 +197,13 @@ def _values(settings: Sequence[Mapping[str, Any]], key: str) -> set[str]:
     return {json.dumps(each[key]) for each in settings if key in each}
 
 
-def _said_by_choice(settings: Sequence[Mapping[str, Any]], key: str) -> bool:
-    choice = f"{key.rpartition('.')[0]}.name"
-    names = {each.get(choice) for each in settings if key in each}
-    if key == choice or len(names) == 1:
-        return False
-    return all(len(_values([each for each in settings if each.get(choice) == name], key)) == 1 for name in names)
-
-
-class Line(NamedTuple):
-    """A line of a printed table: text cells, and whether it is the paper's."""
-
-    cells: Sequence[str]
-    paper: bool
-
-
 class Layout(NamedTuple):
-    """A printed table: `labels` of its headings say what was set, the others are numbers."""
+    """A printed table: `labels` of its headings say what was set, the others are numbers; each line of cells is with
+    whether it is the paper's."""
 
     headings: Sequence[str]
     labels: int
-    lines: Sequence[Line]
+    lines: Sequence[tuple[Sequence[str], bool]]
 
 
 def layout(table: SweepTable) -> Layout:
@@ -221,7 +213,7 @@ def layout(table: SweepTable) -> Layout:
     for row in table.with_paper():
         ours = [*(shown(row.settings.get(key)) for key in table.columns), str(len(row.runs))]
         cells = [row.source, *[""] * len(table.columns)] if row.paper else ours
-        lines.append(Line([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
+        lines.append(([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
     return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
 
 
@@ -232,7 +224,7 @@ def terminal(content: Layout, width: int) -> list[Table]:
     """
     labels = range(content.labels)
     columns = []
-    for place, cells in enumerate(zip(content.headings, *(line.cells for line in content.lines), strict=True)):
+    for place, cells in enumerate(zip(content.headings, *(cells for cells, _ in content.lines), strict=True)):
         if place not in labels:
             heading = re.sub(r"(.+)@(\d+)", r"@\2\n\1", cells[0]).replace(" ", "\n")
             cells = heading, *(re.sub(r"\b0\.", ".", cell).replace(" ± ", "\n±") for cell in cells[1:])
@@ -247,8 +239,8 @@ def terminal(content: Layout, width: int) -> list[Table]:
         for cells in columns[first : first + fitting]:
             table.add_column(cells[0], justify="right", no_wrap=True)
         drawn = zip(*columns[: len(labels)], *columns[first : first + fitting], strict=True)
-        for line, cells in zip(content.lines, list(drawn)[1:], strict=True):
-            table.add_row(*cells, style="dim" if line.paper else "")
+        for (_, paper), cells in zip(content.lines, list(drawn)[1:], strict=True):
+            table.add_row(*cells, style="dim" if paper else "")
         tables.append(table)
     return tables
 
@@ -300,10 +292,10 @@ def counted(objects: Objects) -> str:
     return f"metrics over {OVER[objects]}; mean and standard deviation over seeds"
 
 
-def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> list[Section]:
-    """The sweeps on a page, and the runs that their tables leave out."""
-    sections = [Section(sweep.title, render("sweep.html.j2", sweep=sweep)) for sweep in sweeps]
-    return [*sections, Section("Left out", render("left_out.html.j2", left_out=left_out))] if left_out else sections
+def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> dict[str, str]:
+    """The sweeps on a page, and the runs that their tables leave out: HTML by title."""
+    sections = {sweep.title: render("sweep.html.j2", sweep=sweep) for sweep in sweeps}
+    return sections | ({"Left out": render("left_out.html.j2", left_out=left_out)} if left_out else {})
 
 
 def write_sweeps(
