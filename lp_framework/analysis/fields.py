@@ -72,7 +72,6 @@ class ExactModel(nn.Module):
         return images.new_zeros(len(images), 1)
 
     def condition(self, reference: Tensor, query: Tensor) -> Tensor:
-        """See `PoseModel`."""
         return reference
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:

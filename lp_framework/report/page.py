@@ -14,7 +14,6 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,6 +40,7 @@ PAGE = "report.html"
 LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of the runs are in the table alone
 WORST = 20  # pairs in the table of the worst
 TRAINING, LANDSCAPE, OVERVIEW = "training.json", "landscape.json", "azimuth.json"
+RESULTS = (RESULT, TRAINING, LANDSCAPE, OVERVIEW)  # the files of which a finished run has one
 POSE = ("latitude_degrees", "longitude_degrees", "radius")
 # What a missing or damaged file leads to; `UserError` is a `ValueError`.
 BROKEN = (
@@ -60,12 +60,11 @@ class RunPart(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """What the page shows of a kind of run: the heading of several, the JSON file with the run's results, what the run
-    is, and by their titles the sections: a template, and what fills it from the run's folder.
+    """What the page shows of a kind of run: a heading for several of them, what the run is, and its sections by title,
+    each a template and what fills it from the run's folder.
     """
 
     heading: str
-    file: str
     about: Callable[[Path], About]
     sections: Mapping[str, tuple[str, Callable[[Path], Mapping[str, Any]]]]
 
@@ -77,7 +76,7 @@ def run_part(folder: Path, contents: Contents) -> RunPart:
     except BROKEN as error:
         about = folder.name, f"run without results: {reason(error)}", {}
     sections = {}
-    configuration = {"Configuration and versions": ("configuration", partial(_configuration, contents.file))}
+    configuration = {"Configuration and versions": ("configuration", _configuration)}
     for title, (template, values) in {**contents.sections, **configuration}.items():
         try:
             sections[title] = render(f"{template}.html.j2", **values(folder))
@@ -111,8 +110,9 @@ def read_rows(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(content))
 
 
-def _configuration(results: str, folder: Path) -> dict[str, Any]:
-    record = read_record(folder / results) if (folder / results).is_file() else {}
+def _configuration(folder: Path) -> dict[str, Any]:
+    results = next((folder / name for name in RESULTS if (folder / name).is_file()), None)
+    record = {} if results is None else read_record(results)
     config = dict(record.get("config") or saved_config(folder / "config.yaml"))
     text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
     return {"config": text, "versions": record.get("versions"), "folder": folder}
@@ -332,19 +332,19 @@ def _about_azimuths(folder: Path) -> About:
 
 
 CONTENTS: Mapping[str, Contents] = {
-    "eval": Contents("Evaluations", RESULT, _about_evaluation, {
+    "eval": Contents("Evaluations", _about_evaluation, {
         "Summary": ("summary", lambda folder: {"result": read_record(folder / RESULT)}),
         "Pairs, failures first": ("pairs", _pairs),
         "Objects": ("objects", _objects), "Errors": ("errors", _errors)}),
-    "train": Contents("Trainings", TRAINING, _about_training, {
+    "train": Contents("Trainings", _about_training, {
         "Losses": ("losses", _losses), "Last values": ("last", lambda folder: read_record(folder / TRAINING))}),
-    "estimate": Contents("Estimates", RESULT, _about_estimate, {
+    "estimate": Contents("Estimates", _about_estimate, {
         "Cameras": ("cameras", _cameras), "Poses": ("poses", _poses)}),
-    "landscape": Contents("Landscapes", LANDSCAPE, _about_landscape, {
+    "landscape": Contents("Landscapes", _about_landscape, {
         "Landscape": ("pairs", _pairs),
         "Pictures": ("pictures", lambda folder: {  # photographs have no fields
             "files": [folder / "landscape.png", *folder.glob("fields.png")]})}),
-    "overview": Contents("Landscapes", OVERVIEW, _about_azimuths, {
+    "overview": Contents("Landscapes", _about_azimuths, {
         "Objects": ("azimuths", lambda folder: read_record(folder / OVERVIEW))}),
 }  # fmt: skip
 

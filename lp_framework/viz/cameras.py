@@ -147,9 +147,8 @@ def cameras_figure(
         x, y = scene.project(camera[:3, 3])
         scene.axes.text(x, y, str(number), zorder=200.0, **_badge(colour))
 
-    places = lower.subplots(rows, math.ceil(cards / rows), squeeze=False).flat
-    for index in range(cards):
-        axes, colour = next(places), colours[index]
+    for index, axes in enumerate(style.panels(lower, cards, math.ceil(cards / rows))):
+        colour = colours[index]
         style.show_image(axes, on_white(images[index]), style.shortened(titles[index], 14), color=colour)
         axes.text(0.07, 0.93, str(numbers[index]), transform=axes.transAxes, **_badge(colour))
         latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
@@ -157,8 +156,6 @@ def cameras_figure(
         axes.set_xlabel(pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, loc="left")
         look = {"fontsize": 6, "fontweight": "bold", "color": colour, "ha": "right", "va": "bottom"}
         axes.text(0.98, 0.02, verdicts[index], transform=axes.transAxes, **look)
-    for axes in places:
-        axes.remove()
     return figure
 
 
@@ -200,11 +197,9 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
     )
     for row, (each, (left, *panels)) in enumerate(zip(objects, parts, strict=True)):
         left.suptitle(style.letter(0, each.title) if row == 0 else each.title, x=0.02, ha="left", fontsize=8.5)
-        places = left.subplots(math.ceil(len(each.images) / IMAGE_COLUMNS), IMAGE_COLUMNS, squeeze=False).flat
-        for index, image in enumerate(each.images):
-            style.show_image(next(places), on_white(image), color=colour_of(index), linewidth=1.4)
-        for axes in places:
-            axes.remove()
+        places = style.panels(left, len(each.images), IMAGE_COLUMNS)
+        for index, (axes, image) in enumerate(zip(places, each.images, strict=True)):
+            style.show_image(axes, on_white(image), color=colour_of(index), linewidth=1.4)
         for number, (panel, poses, word) in enumerate(zip(panels, each.predicted, each.words, strict=True)):
             scene = Scene(panel.subplots(), best_viewpoint(each.poses), float(each.poses[:, 2].max()))
             _draw_method(scene, each, poses)

@@ -203,12 +203,10 @@ def pair_figure(
     figure.legend(handles=marks, loc="outside lower right", ncols=len(marks), handletextpad=0.3, columnspacing=1.3)
     if lower is not None:
         lower.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
-        places = lower.subplots(rows, min(len(views), 5), squeeze=False).flat
-        for number, (image, words) in enumerate(zip(views, ends_in_words(pair), strict=True)):
+        panels = style.panels(lower, len(views), 5)
+        for number, (axes, image, words) in enumerate(zip(panels, views, ends_in_words(pair), strict=True)):
             frame: Any = {"color": style.ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
-            style.show_image(next(places), image, ": ".join(filter(None, words)), **frame)
-        for axes in places:
-            axes.remove()
+            style.show_image(axes, image, ": ".join(filter(None, words)), **frame)
     return figure
 
 

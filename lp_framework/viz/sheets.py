@@ -35,15 +35,11 @@ def objects_figure(cards: Sequence[ObjectCard]) -> Figure:
     rows, side = math.ceil(len(shown) / columns), min(8.0 / columns, LARGEST)
     fewer = f" (the {len(shown)} worst of {len(ranked)})" if len(shown) < len(ranked) else ""
     figure, body = style.page(8.0, 0.6 + rows * (side + 0.45), f"Objects, worst first{fewer}")
-    places = body.subplots(rows, columns, squeeze=False).flat
-    for each in shown:
-        axes = next(places)
+    for axes, each in zip(style.panels(body, len(shown), columns), shown, strict=True):
         name = style.shortened(each.name.replace("_", " "), 14.5 * side)
         style.show_image(axes, each.image, name, color=style.CLASS_COLOURS[each.ambiguity], linewidth=1.6)
         success = "" if each.success is None else f"\nSR(R)@30 {each.success:.2f}"
         axes.set_xlabel(f"R(R)@15 {each.recall:.2f}{success}", fontsize=7, loc="left")
-    for axes in places:
-        axes.remove()
     keys = style.class_keys([each.ambiguity for each in shown])
     figure.legend(handles=keys, loc="outside lower right", ncols=len(keys))
     return figure

@@ -58,6 +58,12 @@ def page(width: float, height: float, title: str, note: str = "") -> tuple[Figur
     return figure, body
 
 
+def panels(part: SubFigure, count: int, columns: int) -> list[Axes]:
+    """So many axes, in rows of at most `columns`."""
+    grid = part.add_gridspec(-(-count // columns), min(count, columns))
+    return [part.add_subplot(grid[divmod(number, columns)]) for number in range(count)]
+
+
 def show_image(axes: Axes, image: NDArray | Image, title: str = "", **frame: Any) -> None:
     """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame, a title above it."""
     axes.imshow(image, interpolation="antialiased")
