@@ -137,7 +137,7 @@ def cameras_figure(
     figure, body = style.page(
         8.0, 5.0 + 1.9 * rows, "Cameras around the object", f"{numbers[0]} is the reference{more}"
     )
-    upper, lower = body.subfigures(2, 1, height_ratios=[4.5, 1.9 * rows])
+    upper, lower = style.stacked(body, 4.5, 1.9 * rows)
     scene = Scene(upper.subplots(), best_viewpoint(poses), furthest)
     for place, (x, y) in enumerate(scene.project(1.09 * furthest * SPOKES[::3])):
         scene.axes.text(x, y, f"{90 * place}°", color=style.MUTED, fontsize=7, ha="center", va="center", zorder=2)
@@ -192,10 +192,9 @@ class CameraScene(NamedTuple):
 def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]) -> Figure:
     """A row an object: its images, the reference framed in red, and a scene a method; true cameras are bold."""
     figure = Figure(figsize=(7.0, 0.3 + 1.7 * len(objects)), layout="constrained")
-    parts = figure.subfigures(
-        len(objects), 1 + len(methods), squeeze=False, width_ratios=[2.0, *[4.8 / len(methods)] * len(methods)]
-    )
-    for row, (each, (left, *panels)) in enumerate(zip(objects, parts, strict=True)):
+    parts = style.stacked(figure, *[1] * len(objects))
+    for row, (each, part) in enumerate(zip(objects, parts, strict=True)):
+        left, *panels = style.beside(part, 2.0, *[4.8 / len(methods)] * len(methods))
         left.suptitle(style.letter(0, each.title) if row == 0 else each.title, x=0.02, ha="left", fontsize=8.5)
         places = style.panels(left, len(each.images), IMAGE_COLUMNS)
         for index, (axes, image) in enumerate(zip(places, each.images, strict=True)):

@@ -167,7 +167,8 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
     above.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     above.yaxis.set_minor_locator(NullLocator())
     above.legend(loc="lower left")
-    for axes in below:
+    if rate is not None:
+        (axes,) = below
         axes.plot(*rate, color=style.INK, linewidth=1.2)
         axes.set(ylabel="learning rate", ylim=(0, None))
         axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0))

@@ -186,10 +186,10 @@ def pair_figure(
     rows, high = -(-len(views) // 5), len(maps) * (0.4 + 5.0 * limit / 180) + 0.5
     below = 0.3 + 1.2 * rows if rows else 0.0
     figure, body = style.page(8.0, 0.8 + max(4.0, high + below), title, note)
-    left, right = body.subfigures(1, 2, width_ratios=[1.9, 6.1])
+    left, right = style.beside(body, 1.9, 6.1)
     for axes, name in zip(left.subplots(2, 1), ("reference", "query"), strict=True):
         style.show_image(axes, getattr(pair, name).image, name)
-    upper, lower = right.subfigures(2, 1, height_ratios=[high, below]) if rows else (right, None)
+    upper, *lower = style.stacked(right, high, below) if rows else [right]
     panels = upper.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
     for axes, each in zip(panels, maps, strict=True):
         drawn = draw_map(axes, each, pair.truth, limit)
@@ -201,9 +201,9 @@ def pair_figure(
         bar.outline.set_visible(False)
     marks = keys(maps, pair.truth)
     figure.legend(handles=marks, loc="outside lower right", ncols=len(marks), handletextpad=0.3, columnspacing=1.3)
-    if lower is not None:
-        lower.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
-        panels = style.panels(lower, len(views), 5)
+    for part in lower:
+        part.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
+        panels = style.panels(part, len(views), 5)
         for number, (axes, image, words) in enumerate(zip(panels, views, ends_in_words(pair), strict=True)):
             frame: Any = {"color": style.ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
             style.show_image(axes, image, ": ".join(filter(None, words)), **frame)
@@ -304,7 +304,7 @@ def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
 def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -> Figure:
     """(a), (b) both images; (c) a row a trajectory, of `views` `[N, K, H, W, 3]` at `steps`; (d) the landscape."""
     figure = Figure(figsize=(WIDTH, max(3.0, 0.4 + 0.65 * len(views))), layout="constrained")
-    left, middle, right = figure.subfigures(1, 3, width_ratios=[1.2, 0.6 + 0.62 * len(steps), 2.5])
+    left, middle, right = style.beside(figure, 1.2, 0.6 + 0.62 * len(steps), 2.5)
     _draw_pair(left.subplots(2, 1), pair)
     middle.suptitle("(c) generated on the way", x=0.02, ha="left", fontsize=8.5)
     grid = middle.subplots(*views.shape[:2], squeeze=False)
@@ -318,7 +318,7 @@ def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -
         start, off = words
         row[0].set_ylabel(f"from {start}\n{off}", fontsize=7, rotation=0, ha="right", va="center",
                           color=style.ANSWER if answer else style.INK)  # fmt: skip
-    above, below = right.subfigures(2, 1, height_ratios=[1, 1.1])
+    above, below = style.stacked(right, 1, 1.1)
     _small_map(above.subplots(), PoseMap("(d) landscape", relief=pair.prior_energy, ways=pair), pair.truth)
     small_surface(below.subplots(subplot_kw={"projection": "3d"}), pair.prior_energy, pair.truth)
     return figure
@@ -337,10 +337,9 @@ def failures_figure(rows: Sequence[FailureRow]) -> Figure:
     """A row a pair: reference above query, views evenly around, rendered above generated, the landscape."""
     figure = Figure(figsize=(WIDTH, 0.3 + 1.75 * len(rows)), layout="constrained")
     count = len(rows[0].generated)
-    for number, (part, (pair, *swept)) in enumerate(
-        zip(figure.subfigures(len(rows), 1, squeeze=False).flat, rows, strict=True)
-    ):
-        left, middle, right = part.subfigures(1, 3, width_ratios=[1.0, 0.3 + 0.55 * count, 2.2])
+    parts = style.stacked(figure, *[1] * len(rows))
+    for number, (part, (pair, *swept)) in enumerate(zip(parts, rows, strict=True)):
+        left, middle, right = style.beside(part, 1.0, 0.3 + 0.55 * count, 2.2)
         _draw_pair(left.subplots(2, 1), pair, [pair.title, ""])
         lines = {name: views for name, views in zip(("mesh", "prior"), swept, strict=True) if views is not None}
         grid = middle.subplots(len(lines), count, squeeze=False)
@@ -362,7 +361,7 @@ def failures_figure(rows: Sequence[FailureRow]) -> Figure:
 def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
     """(a) reference and query, then the pair's four maps and exp(-E) of two energies by title, in two rows."""
     figure = Figure(figsize=(WIDTH, 3.1), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=[4.6, 2.2])
+    left, right = style.beside(figure, 4.6, 2.2)
     panels = left.subplot_mosaic("abc\nqde", width_ratios=[1.1, 1.5, 1.5])
     _draw_pair([panels["a"], panels["q"]], pair, ["(a) reference", "query"])
     for place, content in zip("bcde", pair.maps, strict=True):
@@ -380,7 +379,7 @@ def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figu
     """A row a pair: reference above query, and its maps, their own titles small; `titles` are those of the columns."""
     figure = Figure(figsize=(WIDTH, 0.4 + 1.45 * len(pairs)), layout="constrained")
     names = [[f"reference {row}", f"query {row}"] for row in range(len(pairs))]
-    mosaic = [[name, *(f"map {row} {column}" for column in range(len(titles)))]
+    mosaic: list[Any] = [[name, *(f"map {row} {column}" for column in range(len(titles)))]
               for row, both in enumerate(names) for name in both]  # fmt: skip
     panels = figure.subplot_mosaic(mosaic, width_ratios=[0.5, *[1.7] * len(titles)])
     for row, (pair, both) in enumerate(zip(pairs, names, strict=True)):

@@ -57,7 +57,7 @@ def views_figure(
     side = min(7.3 / columns, LARGEST)
     figure, body = style.page(2.6 + side * columns, 1.2 + max(1.9, side * rows), title, note)
     figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)
-    left, right = body.subfigures(1, 2, width_ratios=[2.0, 0.6 + side * columns])
+    left, right = style.beside(body, 2.0, 0.6 + side * columns)
     style.show_image(left.subplots(), source, "source")
     grid = right.subplots(rows, columns, squeeze=False)
     for row, latitude in zip(range(rows), latitudes_degrees, strict=True):

@@ -52,10 +52,20 @@ def page(width: float, height: float, title: str, note: str = "") -> tuple[Figur
     """A figure (inches) with a title and a note below it, and what is left of it for panels."""
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    body: SubFigure = figure.subfigures()
+    (body,) = stacked(figure, 1)
     if note:
         body.suptitle(note, x=0.01, ha="left", color=MUTED, fontsize=8)
     return figure, body
+
+
+def beside(part: Figure | SubFigure, *widths: float) -> list[SubFigure]:
+    """Parts of a figure side by side, of these relative widths."""
+    return list(part.subfigures(1, len(widths), squeeze=False, width_ratios=widths)[0])
+
+
+def stacked(part: Figure | SubFigure, *heights: float) -> list[SubFigure]:
+    """Parts of a figure above each other, of these relative heights."""
+    return list(part.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
 
 
 def panels(part: SubFigure, count: int, columns: int) -> list[Axes]:
