@@ -154,7 +154,7 @@ def cameras_figure(
         latitude, longitude = (round(math.degrees(angle), 1) + 0.0 for angle in poses[index, :2])  # + 0.0: no minus 0
         pose = f"latitude {latitude:.1f}°\nlongitude {longitude:.1f}°\nradius {poses[index, 2]:.2f}"
         axes.set_xlabel(pose.replace("-", "\N{MINUS SIGN}"), fontsize=7, loc="left")
-        look = {"fontsize": 6, "fontweight": "bold", "color": colour, "ha": "right", "va": "bottom"}
+        look: dict[str, Any] = {"fontsize": 6, "fontweight": "bold", "color": colour, "ha": "right", "va": "bottom"}
         axes.text(0.98, 0.02, verdicts[index], transform=axes.transAxes, **look)
     return figure
 

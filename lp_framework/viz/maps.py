@@ -203,8 +203,8 @@ def pair_figure(
     figure.legend(handles=marks, loc="outside lower right", ncols=len(marks), handletextpad=0.3, columnspacing=1.3)
     for part in lower:
         part.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
-        panels = style.panels(part, len(views), 5)
-        for number, (axes, image, words) in enumerate(zip(panels, views, ends_in_words(pair), strict=True)):
+        shown = zip(style.panels(part, len(views), 5), views, ends_in_words(pair), strict=True)
+        for number, (axes, image, words) in enumerate(shown):
             frame: Any = {"color": style.ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
             style.show_image(axes, image, ": ".join(filter(None, words)), **frame)
     return figure
@@ -226,7 +226,7 @@ def small_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> 
     axes.patch.set_visible(False)
     axes.tick_params(labelsize=6, pad=-4)
     axes.locator_params(axis="z", nbins=3)
-    axes.set_box_aspect((2.0, 1.2, 0.95), zoom=1.3)  # axes in 3-D leave wide margins
+    axes.set_box_aspect((2.0, 1.2, 0.95), zoom=1.2)  # axes in 3-D leave wide margins
     axes.set_in_layout(False)
     small_marks(axes)
 
