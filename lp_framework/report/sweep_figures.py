@@ -48,12 +48,11 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Curves over one axis: its label, and whether it is logarithmic."""
+    """Curves over one axis, which is logarithmic for `TIME`."""
 
     title: str
     xlabel: str
     curves: Sequence[Curve]
-    logarithmic: bool = False
 
 
 def draw_sweep(table: SweepTable, folder: Path) -> Sweep:
@@ -85,9 +84,10 @@ def cost_figure(table: SweepTable) -> Figure | None:
     solvers = [row.settings.get(SOLVER) for row in table.rows]
     if len(set(solvers)) < 2 or len(table.rows) > len(COLOURS) or is_swept(table, "start.count"):
         return None
+    rows = {label(row.settings): row for row in table.rows}
     return curves_figure(
         [
-            Panel(name, TIME, [_curve(label(row.settings), [row], None, name) for row in table.rows], logarithmic=True)
+            Panel(name, TIME, [_curve(title, [row], None, name) for title, row in rows.items()])
             for name in ROTATION_RECALL
         ]
     )
@@ -108,7 +108,7 @@ def curves_figure(panels: Sequence[Panel]) -> Figure:
                 zorder=2 if theirs else 3, label=PAPER if theirs else curve.label,
             )  # fmt: skip
         axes.set_xlabel(panel.xlabel)
-        if panel.logarithmic:
+        if panel.xlabel == TIME:
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())
         else:
@@ -195,7 +195,7 @@ def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str],
             curves.append(_curve(called, rows, over, name))
             if theirs := [each for each in papers if name in each.metrics]:
                 curves.append(_curve(called, theirs, over, name))
-    return Panel(title, TIME if by_time else AXES[axis], curves, logarithmic=by_time)
+    return Panel(title, TIME if by_time else AXES[axis], curves)
 
 
 def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:

@@ -198,8 +198,9 @@ def _values(settings: Sequence[Mapping[str, Any]], key: str) -> set[str]:
 
 
 class Layout(NamedTuple):
-    """A printed table: `labels` of its headings say what was set, the others are numbers; each line of cells is with
-    whether it is the paper's."""
+    """A printed table: the first `labels` headings say what was set, the others are numbers. A line is its cells, and
+    whether it is the paper's.
+    """
 
     headings: Sequence[str]
     labels: int
