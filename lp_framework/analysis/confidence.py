@@ -110,11 +110,8 @@ def in_words(latitude: float, longitude: float) -> str:
     if not math.isfinite(latitude + longitude):
         return "no pose"
     up, right = round(math.degrees(latitude)), round(math.degrees(_turn(longitude)))
-    parts = (
-        [f"{abs(right)}° {'round' if abs(right) == 180 else 'to the right' if right > 0 else 'to the left'}"]
-        if right
-        else []
-    )
+    side = "round" if abs(right) == 180 else "to the right" if right > 0 else "to the left"
+    parts = [f"{abs(right)}° {side}"] if right else []
     parts += [f"{abs(up)}° {'up' if up > 0 else 'down'}"] if up else []
     return ", ".join(parts) or "the same viewpoint"
 
