@@ -116,8 +116,8 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray], field_of_view: float
 
 def pair_plots(pair: ShownPair) -> dict[str, go.Figure]:
     """The plots of a pair by their kind: from above, as relief where it has landscapes, and the cameras."""
-    relief = {"surface": _surface_plot(pair)} if pair.landscapes else {}
-    return {"map": _map_plot(pair), **relief, "cameras": _pair_cameras_plot(pair)}
+    relief = {"surface": surface_plot(pair)} if pair.landscapes else {}
+    return {"map": map_plot(pair), **relief, "cameras": _pair_cameras_plot(pair)}
 
 
 def frame_steps(pair: ShownPair) -> list[int]:
@@ -126,7 +126,7 @@ def frame_steps(pair: ShownPair) -> list[int]:
     return steps
 
 
-def _map_plot(pair: ShownPair) -> go.Figure:
+def map_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes from above (degrees), and the ways of all starts over them."""
     ends = [pose[0] for pose in (pair.truth, _parts(pair)[1][0, -1]) if pose is not None]
     limit = max(60.0, *(abs(math.degrees(each)) + 5 for each in np.nan_to_num(ends)))
@@ -155,7 +155,7 @@ def _map_plot(pair: ShownPair) -> go.Figure:
     return _framed(figure, pair, _add_moving(figure, pair, _on_map, others, (8, 12), line=edge))
 
 
-def _surface_plot(pair: ShownPair) -> go.Figure:
+def surface_plot(pair: ShownPair) -> go.Figure:
     """A pair's landscapes as relief, with the ways of all starts on it; the truth is a pole."""
     angle = {"ticksuffix": "°", "showspikes": False}
     axes = {
