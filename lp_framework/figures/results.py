@@ -107,6 +107,8 @@ class RecallFigure(PaperFigure):
     def analyse(self, seed: int, device: torch.device) -> SweepTable:
         """The table of the experiment; nothing is drawn at random."""
         make = f"`python -m lp_framework eval experiment={EXPERIMENT}` makes them"
+        if not Path(self.runs).is_dir():
+            raise UserError(f"figure.runs={self.runs}: there is no such folder of finished runs; {make}")
         found, _ = find_runs([Path(self.runs)])
         tables, unlabelled = sweep_tables(found, self.objects)
         table = next((each for each in tables if each.experiment == EXPERIMENT and is_swept(each, COUNT)), None)
