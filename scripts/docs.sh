@@ -1,0 +1,8 @@
+#!/usr/bin/env bash
+# Build the documentation as a website, strictly: warnings are errors. An argument names the folder, else build/docs.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+bash scripts/setup.sh
+site="${1:-build/docs}"
+.venv/bin/python -m sphinx --fail-on-warning --keep-going --quiet docs "$site"
+echo "docs: open $site/index.html"

@@ -1,0 +1,129 @@
+"""The documentation: it builds strictly and without network, and names everything that is public or can be chosen."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import io
+import re
+import socket
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from sphinx.application import Sphinx
+from sphinx.util.docutils import docutils_namespace, patch_docutils
+from sphinx.util.inventory import InventoryFile
+
+import lp_framework
+
+ROOT = Path(__file__).parents[1]
+DOCS, CONF = ROOT / "docs", ROOT / "conf"
+PAGES = [*DOCS.rglob("*.md"), *ROOT.glob("*.md"), *ROOT.glob("plugins/*/README.md")]
+
+
+def no_network(*arguments: object) -> None:
+    raise OSError("the documentation has to build without network")
+
+
+def test_the_site_builds_without_warning_or_network_and_is_complete(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(socket.socket, "connect", no_network)
+    site, warnings = tmp_path / "site", io.StringIO()
+    # The notebook has a test of its own, which runs beside this one.
+    quiet = {"nb_execution_mode": "off"}
+    with patch_docutils(DOCS), docutils_namespace():
+        Sphinx(DOCS, DOCS, site, tmp_path / "trees", "html", quiet, status=None, warning=warnings).build()
+    assert warnings.getvalue() == ""
+
+    for page in site.rglob("*.html"):  # it can be read without network, too
+        fetched = re.findall(r'<(?:script|img|iframe)[^>]* src="([^"]+)|<link[^>]* href="([^"]+)', page.read_text())
+        assert [address for pair in fetched for address in pair if re.match(r"(https?:)?//", address)] == []
+
+    assert '<math xmlns="http://www.w3.org/1998/Math/MathML"' in (site / "method.html").read_text()
+
+    for file in [file for file in CONF.rglob("*.yaml") if file.parent != CONF]:
+        folder = file.parent.relative_to(CONF)
+        page = (site / "catalogue" / f"{folder.name}.html").read_text()
+        assert f">{folder.as_posix()}={file.stem}<" in page, file
+    commands = (site / "catalogue" / "commands.html").read_text()
+    assert [file.stem for file in CONF.glob("*.yaml") if f">{file.stem}<" not in commands] == []
+
+    inventory = InventoryFile.loads((site / "objects.inv").read_bytes(), uri="")
+    entries = {name for kind in inventory.data if kind.startswith("py:") for name in inventory.data[kind]}
+    assert {f"lp_framework.{name}" for name in lp_framework.__all__} <= entries
+    assert [name for name in entries if not inspect.getdoc(found(name))] == []
+    for name in entries:  # what a plugin has to write is described
+        for method in getattr(found(name), "__abstractmethods__", ()):
+            assert f"{name}.{method}" in entries
+
+
+def found(name: str) -> object:
+    """The object of a dotted name."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            here: object = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            here = getattr(here, part)
+        return here
+    raise AssertionError(f"nothing is called {name}")
+
+
+@pytest.mark.heavy
+def test_the_notebook_runs_and_finds_the_poses_that_it_tells_of():
+    notebook = nbformat.read(DOCS / "notebook.ipynb", as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell for cell in code if cell.outputs or cell.execution_count] == []  # outputs are not committed
+    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(DOCS)}}).execute()
+    outputs = [output for cell in code for output in cell.outputs]
+    text = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    around, up, probability = re.search(r"(\d+)° around, (\d+)° up; .* ([\d.]+)", text).groups()
+    assert abs(int(around) - 60) <= 6 and abs(int(up) - 10) <= 6 and float(probability) > 0.8
+    truth = int(re.search(r"truth: (\d+)°", text)[1])
+    ends = {
+        solver: [int(end) for end in re.findall(r"\d+", line)] for solver, line in re.findall(r"(\w+) ends(.*)", text)
+    }
+    off = {solver: [abs((end - truth + 180) % 360 - 180) for end in each] for solver, each in ends.items()}
+    assert max(off["two_stage"]) <= 3
+    assert sorted(error > 150 for error in off["ifusion"]) == [False, False, True, True]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_relative_links_lead_to_files(page):
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = re.findall(r"\]\(<?([^)>#\s]+)", text)
+    missing = [each for each in targets if "://" not in each and not (page.parent / each).exists()]
+    assert missing == []
+
+
+def choices() -> ModuleType:
+    sys.path.append(str(DOCS / "_extensions"))
+    try:
+        return importlib.import_module("choices")
+    finally:
+        sys.path.pop()
+
+
+def test_settings_of_a_yaml_file_become_rows():
+    text = """\
+    second: # of the second stage
+      starts: [1, 2] # numbers of starts
+      # The following apply to both.
+      deep:
+        rate: 0.1 # step size
+    steps: 3
+    """
+    lines = [line[4:] for line in text.splitlines()]
+    assert list(choices().settings(lines)) == [
+        ("second", "", "of the second stage"),
+        ("second.starts", "[1, 2]", "numbers of starts"),
+        ("second.deep.rate", "0.1", "step size"),
+        ("steps", "3", ""),
+    ]
