@@ -54,7 +54,7 @@ def listed() -> dict[str, tuple[str, str]]:
     found = {}
     for line in (ROOT / "docs" / "dependencies.md").read_text().splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if line.startswith("| ") and not line.startswith(("| ---", "| package")):
+        if line.startswith("| ") and not line.startswith(("| ---", "| Package")):
             extra = cells[1] if len(cells) == 4 else ""
             assert normal(cells[0]) not in found and len(cells[-1]) > 3
             found[normal(cells[0])] = (extra, cells[-2])
