@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup check coverage format quickstart
+.PHONY: help setup check coverage format docs quickstart
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/\1\t\2/' | expand -t 14
@@ -15,6 +15,9 @@ coverage: ## how much of the mathematics the tests run
 
 format: setup ## put the sources in order
 	@.venv/bin/ruff format . && .venv/bin/ruff check --fix .
+
+docs: ## build the documentation into build/docs, strictly
+	@bash scripts/docs.sh
 
 quickstart: ## render the embedded objects, train, evaluate
 	@bash scripts/quickstart.sh

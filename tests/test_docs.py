@@ -11,14 +11,16 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import nbformat
 import pytest
+
+import lp_framework
+
+pytest.importorskip("myst_nb", reason="the documentation is built with the packages of the extra docs")
+import nbformat
 from nbclient import NotebookClient
 from sphinx.application import Sphinx
 from sphinx.util.docutils import docutils_namespace, patch_docutils
 from sphinx.util.inventory import InventoryFile
-
-import lp_framework
 
 ROOT = Path(__file__).parents[1]
 DOCS, CONF = ROOT / "docs", ROOT / "conf"

@@ -61,18 +61,15 @@ class Choices(SphinxDirective):
         section = nodes.section(ids=[nodes.make_id(name)], names=[name])
         section += nodes.title("", "", nodes.literal("", name))
         section += nodes.paragraph("", "", *prose(config.summary))
-        if bases := [based_on(entry) for entry in config.defaults if entry != "_self_"]:
-            section += nodes.paragraph(
-                "", "", nodes.Text("Builds on "), *separated(bases), nodes.Text(".")
-            )
         if group == "experiment":
             section += yaml_block(text)
-        elif rows := [
-            row
-            for key, lines in config.settings.items()
-            if key != "name"
-            for row in settings(lines)
-        ]:
+            return section
+        if bases := [based_on(entry) for entry in config.defaults if entry != "_self_"]:
+            section += nodes.paragraph(
+                "", "Builds on ", *separated(bases), nodes.Text(".")
+            )
+        own = (lines for key, lines in config.settings.items() if key != "name")
+        if rows := [row for lines in own for row in settings(lines)]:
             section += table(rows)
         return section
 
