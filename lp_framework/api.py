@@ -39,17 +39,23 @@ def estimate_pose(
     crop: bool = True,
     remove_background: bool = False,
 ) -> Solution:
-    """The pose of `query` relative to `reference`, two pictures of one object; `.answer()` of the result is `[1, 3]`:
-    latitude and longitude (radians, the latter in [0, 2 pi)) and radius (object sizes), query minus reference.
+    """Estimate the pose of `query` relative to `reference`, two pictures of one object.
 
-    A picture is a file, an image of Pillow or an array `[H, W, 3 | 4]` (uint8, or floats in [0, 1]). It is prepared as
-    `data.photographs` says: cut out by its alpha channel, or by a mask made with `remove_background`, centred and
-    scaled. With `crop=False` it is a whole square view, on white where it has no alpha channel.
+    `.answer()` of the result is `[1, 3]`, query minus reference: latitude and longitude in radians (the latter in
+    [0, 2 pi)) and radius in object sizes.
 
-    `solver`, `prior` and `starts` are registered names or objects built by the functions below. A name gets the prior
-    and the model that it asks for (`model` is weights that ship, a checkpoint, a run's folder or a model) on the GPU,
-    where there is one; a built solver has its own. The result's `probability` is that of being within 30 degrees, of
-    models that have a density, as `general` has; the crop loses the distance, so their relative radii are 0 then.
+    A picture is a file, a Pillow image or an array `[H, W, 3 | 4]` (uint8, or floats in [0, 1]). The object is cut out
+    by the alpha channel, or by a mask made with `remove_background=True`, then centred and scaled. With `crop=False` a
+    picture is a whole square view, on white if it has no alpha channel.
+
+    `solver`, `prior` and `starts` are registered names or objects built by the functions below. A solver chosen by name
+    gets the prior and the model that it needs, on the GPU if there is one; a built solver keeps its own. `model` is the
+    name of weights that ship, a checkpoint, the folder of a training run, or a model.
+
+    If the model has a density, as `general` has, the result's `probability` is that of being within 30 degrees of the
+    truth, and the relative radius is 0, because the crop loses the distance.
+
+    Raises `UserError` for a picture that cannot be read or has no object, and for an unknown name.
     """
     prepared = []
     for name, picture in (("reference", reference), ("query", query)):
@@ -71,23 +77,28 @@ def estimate_pose(
 
 
 def load_model(checkpoint: str | Path = "score") -> PoseModel:
-    """A trained model: weights that ship under a name, a checkpoint file, a training run's folder or a hub id."""
+    """Load a trained model by the name of weights that ship, a checkpoint file, a training run's folder or a hub id."""
     return read_model(checkpoint)
 
 
 def load_prior(name: str, **arguments: Any) -> Prior:
-    """A pose-conditioned diffusion prior by the name of a choice of `prior=`, frozen."""
+    """Load a frozen pose-conditioned diffusion prior; `name` and `arguments` are those of `prior=` in the catalogue."""
     return registry.build("prior", _settings("prior", name, arguments))
 
 
 def load_solver(name: str, model: PoseModel | None = None, prior: Prior | None = None, **arguments: Any) -> Solver:
-    """A solver by the name of a choice of `solver=`, with the model and the prior that it asks for and its settings."""
+    """Build a solver; `name` and `arguments` are those of `solver=` in the catalogue.
+
+    Raises `UserError` if the solver needs a `model` or a `prior` that is not given, and for an unknown setting.
+    """
     return registry.build("solver", _settings("solver", name, arguments), model=model, prior=prior)
 
 
 def make_starts(name: str, model: PoseModel | None = None, prior: Prior | None = None, **arguments: Any) -> Starts:
-    """Starts by the name of a choice of `start=`, with the model (`modes`) or the prior that it asks for;
-    `.make(pairs, seed)` gives `[B, N, 3]` relative poses."""
+    """Build starts (initial poses); `name` and `arguments` are those of `start=` in the catalogue.
+
+    `.make(pairs, seed)` of the result gives relative poses `[B, N, 3]`. `start=modes` needs a `model`.
+    """
     return registry.build("start", _settings("start", name, arguments), model=model, prior=prior)
 
 

@@ -38,7 +38,11 @@ DEPTH_UNIT = 1e-4  # scene units a level of a depth image
 
 @dataclass(frozen=True)
 class ObjectViews:
-    """The V views of one object in one split; `unique_answer`: whether one has one right longitude, None: unknown."""
+    """The V views of one object in one split.
+
+    `ambiguity` is one of `AMBIGUITIES`; `unique_answer` says whether a view has one right longitude (None: unknown).
+    `cameras` `[V, 4, 4]` are camera to world, `field_of_view` `[V]` is in radians.
+    """
 
     name: str
     split: str
@@ -58,9 +62,11 @@ class ObjectViews:
 
 
 def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
-    """The views of an object in a split ("train" or "test"); `UserError` naming the file for a missing or malformed
-    `transform.json`, a missing image, a matrix that is not a camera that looks at the origin, and pixels that are not
-    square or not about the image's middle."""
+    """The views of an object in a split ("train" or "test").
+
+    Raises `UserError`, naming the file, for a missing or malformed `transform.json`, a missing image, a matrix that is
+    not a camera looking at the origin, and pixels that are not square or not centred.
+    """
     path = Path(root) / name / split / TRANSFORMS
     content = read_json(path)
     with expecting(f"{path}: needs camera_angle_x and frames with file_path and transform_matrix"):
@@ -117,16 +123,16 @@ def write_transforms(folder: Path, frames: list[dict[str, Any]], **more: Any) ->
 
 
 class ViewSource(ABC):
-    """A set of objects whose views lie in the folder `path`, once they are prepared."""
+    """A set of objects whose views are in the folder `path` after `prepare`."""
 
     path: Path
 
     @abstractmethod
     def names(self) -> list[str]:
-        """The objects, sorted; of these alone, whatever else lies in `path`."""
+        """The names of the objects, sorted."""
 
     def prepare(self) -> None:  # noqa: B027
-        """Make the views that are missing in `path`, in one process; a run that was stopped is gone on with."""
+        """Make the views that are missing in `path`, in one process; resumes after an interruption."""
 
     def views(self, name: str, split: str) -> ObjectViews:
         """The views of an object in a split ("train" or "test")."""

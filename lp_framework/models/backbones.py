@@ -20,7 +20,7 @@ ON_CPU, ON_GPU = 1, 256
 
 
 class Backbone(nn.Module):
-    """What models ask of a backbone. A subclass sets the attributes and gives `trunk_features` and `head`."""
+    """Turns images into features. A subclass sets the attributes and implements `trunk_features` and `head`."""
 
     image_size: int  # pixels a side of what the trunk sees
     trunk_dim: int
@@ -51,7 +51,7 @@ class Backbone(nn.Module):
         raise NotImplementedError
 
     def fingerprint(self) -> str:
-        """A text that changes when the trunk's output for some image would: its class, sizes and weights."""
+        """A hash of the trunk's class, sizes and weights, by which cached features are keyed."""
         digest = hashlib.blake2b(f"{type(self).__qualname__} {self.image_size} {self.trunk_dim}".encode())
         for name, value in self.trunk_module().state_dict().items():
             digest.update(name.encode())
@@ -59,7 +59,7 @@ class Backbone(nn.Module):
         return digest.hexdigest()
 
     def train(self, mode: bool = True) -> Backbone:
-        """As every module, but a frozen trunk stays in evaluation mode."""
+        """Set the training mode; a frozen trunk stays in evaluation mode."""
         super().train(mode)
         if self.frozen:
             self.trunk_module().eval()

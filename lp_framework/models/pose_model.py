@@ -27,7 +27,7 @@ LOW, HIGH = (-math.pi / 3, 0.0, -0.8), (math.pi / 3, 2 * math.pi, 0.8)
 
 
 class FieldValue(NamedTuple):
-    """A model at given poses: `score` `[..., 3]` and, of an energy model, `energy` `[...]`."""
+    """The value of a model at given poses: `score` `[..., 3]` and, for energy models, `energy` `[...]`."""
 
     score: Tensor
     energy: Tensor | None
@@ -36,10 +36,10 @@ class FieldValue(NamedTuple):
 class PoseModel(TrainedModule):
     """A score or energy of the relative pose, given two images.
 
-    Solvers ask three things of it: `encode` images once, `condition` on pairs of them, then the `field` at any poses.
-    Of *codes* they ask only that an index tensor picks from them as from a batch, `codes[pairs.reference]`; of a
-    *condition* that it can be indexed along the pairs and given further dimensions there, `condition[:, None]`, so that
-    it broadcasts against poses `[B, N, 3]`. They may be tensors or any object that does so.
+    Solvers call `encode` once per image, `condition` once per pair, and then `field` at any poses. *Codes* are tensors
+    or any objects that can be indexed like a batch, `codes[pairs.reference]`. A *condition* is a tensor or any object
+    that can be indexed along the pairs and given further dimensions, `condition[:, None]`, to broadcast against poses
+    `[B, N, 3]`.
     """
 
     sigma: float  # radians and scene units: the field's score is (truth - x) / sigma^2 near an only truth
@@ -54,23 +54,25 @@ class PoseModel(TrainedModule):
 
     @abstractmethod
     def condition(self, reference: Any, query: Any) -> Any:
-        """The condition of P pairs, from the codes of either side."""
+        """The condition of P pairs, from the codes of their references and queries."""
 
     @abstractmethod
     def field(self, condition: Any, pose: Tensor) -> FieldValue:
         """Score (and energy) at relative poses `[..., 3]`, at the model's `sigma`."""
 
     def modes(self, condition: Any, count: int) -> Tensor:
-        """The most likely poses `[P, count, 3]`, best first; `UserError` of a model that cannot tell them."""
+        """The most likely poses `[P, count, 3]`, best first; `UserError` if the model has no density."""
         raise UserError("start=modes needs model=matching; score and energy networks cannot tell their modes")
 
     def probability(self, condition: Any, pose: Tensor, degrees: float = 30.0) -> Tensor | None:
-        """That the true rotation lies within so many degrees of relative poses `[..., 3]`, `[...]`, which go with the
-        conditions as those of `field`; None of a model without a density."""
+        """The probability `[...]` that the true rotation is within `degrees` of that of relative poses `[..., 3]`.
+
+        None for a model without a density.
+        """
         return None
 
     def at_sigma(self, condition: Any, sigma: float) -> Any:
-        """The condition under which `field` is at another `sigma`; `UserError` of a model that knows only one."""
+        """The condition under which `field` is at another `sigma`; `UserError` if the model knows only one."""
         raise UserError(
             "solver.sigma needs model=matching, whose field is known at every sigma; score and energy networks know "
             f"the one that they were trained at, {self.sigma:g}"

@@ -14,9 +14,9 @@ from lp_framework.errors import UserError
 
 @dataclass(frozen=True)
 class ViewCode:
-    """All that a prior keeps of B images: `latent` `[B, C, h, w]` and `embedding` `[B, tokens, channels]`.
+    """What a prior keeps of B images: `latent` `[B, C, h, w]` and `embedding` `[B, tokens, channels]`.
 
-    Indexing is that of a batch: `code[2:5]`, `code[index]` with integers `[N]`.
+    It can be indexed like a batch: `code[2:5]`, or `code[index]` with integers `[N]`.
     """
 
     latent: Tensor
@@ -44,7 +44,7 @@ class Prior(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, images: Tensor) -> ViewCode:
-        """The code of images `[B, 3, H, W]` in [-1, 1] on white, resized where need be; once an image is enough."""
+        """The codes of images `[B, 3, H, W]` in [-1, 1] on white, which are resized if necessary."""
 
     @abstractmethod
     def residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
@@ -75,11 +75,11 @@ class Prior(nn.Module, ABC):
         views of a call have the same draws."""
 
     def train(self, mode: bool = True) -> Prior:
-        """As every module, but a prior stays in evaluation mode."""
+        """Does nothing: a prior stays in evaluation mode."""
         return super().train(False)
 
     def check(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> None:
-        """`UserError` where the arguments of `residual` do not fit each other."""
+        """Raise `UserError` if the shapes or timesteps of the arguments of `residual` are wrong."""
         batch, latents = len(pose), {"target": target.latent, "source": source.latent, "noise": noise}
         shapes: dict[str, tuple[int, ...]] = {**dict.fromkeys(latents, self.latent_shape), "pose": (3,), "timestep": ()}
         for name, tensor in {**latents, "pose": pose, "timestep": timestep}.items():

@@ -17,9 +17,12 @@ from lp_framework.keyed_random import keyed_bits
 
 @dataclass(frozen=True)
 class Pairs:
-    """B problems among I images: `images` `[I, 3, H, W]` in [-1, 1] on white, each once; `reference`, `query` `[B]`
-    point to them; `ids` `[B]` are integers that name the pairs for good, to which random draws are keyed. The images'
-    `field_of_view` `[I]` is in radians, on the CPU; None: that of the priors."""
+    """B pairs among I images.
+
+    `images` `[I, 3, H, W]` in [-1, 1] on white contains each image once; `reference` and `query` `[B]` are indices into
+    it. `ids` `[B]` are integers that identify the pairs and key the random draws. `field_of_view` `[I]` is in radians,
+    on the CPU; None stands for that of the priors.
+    """
 
     images: Tensor
     reference: Tensor
@@ -45,8 +48,10 @@ def pairs_of(batch: PairBatch, device: torch.device) -> Pairs:
 
 @dataclass(frozen=True)
 class ViewSets:
-    """S problems of V >= 2 images each: `images`, `ids` `[S]` and `field_of_view` are as those of `Pairs`; `views`
-    `[S, V]` point to the images."""
+    """S sets of V >= 2 images each, to be solved jointly.
+
+    `views` `[S, V]` are indices into `images`. `images`, `ids` `[S]` and `field_of_view` are as in `Pairs`.
+    """
 
     images: Tensor
     views: Tensor
@@ -63,12 +68,12 @@ class ViewSets:
         return len(self.views)
 
     def with_first(self) -> Pairs:
-        """The pairs of each set's first image, as reference, with its others: S x (V - 1), those of a set together."""
+        """The S x (V - 1) pairs of each set's first image, as the reference, with its other images, set by set."""
         views = self.views.shape[1]
         return self.pairs([0] * (views - 1), range(1, views))
 
     def pairs(self, reference: Sequence[int], query: Sequence[int]) -> Pairs:
-        """P pairs of places within a set, for every set: S x P problems, those of a set together, ids keyed by both."""
+        """The S x P pairs of the positions `reference[P]` and `query[P]` within each set, set by set."""
         places = torch.tensor([list(reference), list(query)])
         ids = keyed_bits(self.ids[:, None], *places, count=1).to(self.ids.device)
         chosen = self.views[:, places.to(self.views.device)]  # [S, 2, P]
@@ -83,7 +88,7 @@ def _check_images(images: Tensor) -> None:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a solution took: passes of samples through the network, and seconds (of the whole batch)."""
+    """The cost of a batch: the number of samples that passed a network, and seconds."""
 
     network_passes: int
     seconds: float
@@ -91,11 +96,17 @@ class Cost:
 
 @dataclass(frozen=True)
 class Solution:
-    """`poses` `[B, N, 3]` final relative poses, `energies` `[B, N]` (lower is better, comparable along N), `valid`
-    `[B, N]`, `chosen` `[B]` index of the start that is the answer; `cameras` `[B, N, 4, 4]` of solvers that predict
-    full ones: the query's in the reference's frame, its translation up to a factor (see `geometry.two_view`);
-    `trajectory` `[B, N, steps + 1, 3]` on request, longitudes unreduced; `probability` `[B, N]` that the true rotation
-    is within 30 degrees of the pose's, of a model that has a density."""
+    """What a solver found for B pairs from N starts each.
+
+    - `poses` `[B, N, 3]`: final relative poses.
+    - `energies` `[B, N]`: lower is better; comparable along N.
+    - `valid` `[B, N]`: whether the start succeeded.
+    - `chosen` `[B]`: index of the start that is the answer.
+    - `cameras` `[B, N, 4, 4]`: only of solvers that predict full cameras; that of the query in the reference's frame,
+      with the translation up to a factor (see `geometry.two_view`).
+    - `trajectory` `[B, N, steps + 1, 3]`: on request; longitudes are not reduced.
+    - `probability` `[B, N]`: only of models with a density; that the true rotation is within 30 degrees of the pose's.
+    """
 
     poses: Tensor
     energies: Tensor
@@ -113,9 +124,13 @@ class Solution:
 
 @dataclass(frozen=True)
 class ViewSolution:
-    """`poses` `[S, V - 1, 3]` of the other views relative to the first; `energies` `[S, V, V]` of the ordered pairs
-    (row: reference, column: query; NaN where a solver did not look); `valid` `[S]`: every pose is sound; `pairs`, where
-    each pair with the first view was solved for itself: the solution of those S x (V - 1) pairs."""
+    """What a solver found for S sets of V views.
+
+    - `poses` `[S, V - 1, 3]`: poses of the other views relative to the first.
+    - `energies` `[S, V, V]`: of the ordered pairs (row: reference, column: query); NaN where they were not computed.
+    - `valid` `[S]`: whether all poses of the set are valid.
+    - `pairs`: if each pair with the first view was solved independently, the solution of those S x (V - 1) pairs.
+    """
 
     poses: Tensor
     energies: Tensor
@@ -125,7 +140,7 @@ class ViewSolution:
 
 
 def choose(energies: Tensor) -> Tensor:
-    """Index `[B]` of the least energy among `[B, N]`; what is not finite is passed over."""
+    """Index `[B]` of the lowest energy of `[B, N]`; values that are not finite are ignored."""
     return energies.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf).argmin(dim=1)
 
 
@@ -153,17 +168,20 @@ class Solver(ABC):
         return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     def samples_per_pair(self, starts: int) -> int:
-        """Samples of a pair that pass the prior at once in the longest loop: of each start both directions."""
+        """Number of samples per pair that pass the prior at once: both directions of each start."""
         return 2 * starts
 
     @abstractmethod
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """Solve all pairs from starts `[B, N, 3]`, all together. A result depends on its pair, start and `seed`."""
+        """Solve all pairs from starts `[B, N, 3]`, in one batch.
+
+        The result of a start depends on its pair, the start and `seed` alone, not on the rest of the batch.
+        """
 
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """Solve sets of V images from starts `[S, V - 1, N, 3]`: N for each other view, relative to the first.
 
-        Unless a solver reasons about all views together, each pair with the first view is solved for itself.
+        By default each pair with the first view is solved independently; solvers that use all views override it.
         """
         check_starts(view_sets, starts)
         return of_first_views(view_sets, self.solve(view_sets.with_first(), starts.flatten(0, 1), seed))

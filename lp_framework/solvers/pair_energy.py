@@ -24,11 +24,11 @@ def keyed_noise(prior: Prior, device: torch.device, *keys: Tensor | int) -> Tens
 
 
 class PairEnergy:
-    """The prior's denoising error of relative poses, the mean over both directions, for B pairs at once.
+    """The prior's denoising error of relative poses, averaged over both directions, for B pairs at once.
 
-    Direction 0 predicts the query from the reference under the pose x; direction 1 the reference from the query under
-    -x. The images are encoded on construction, unless their codes are given. `passes` counts the samples that have gone
-    through the network: encoded images, and two a pose and call.
+    Direction 0 predicts the query from the reference under the pose x, direction 1 the reference from the query under
+    -x. The images are encoded on construction, unless their codes are given. `passes` counts the samples that have
+    passed the network: encoded images, and two per pose and call.
     """
 
     def __init__(self, prior: Prior, pairs: Pairs, seed: int, codes: ViewCode | None = None) -> None:
@@ -45,7 +45,7 @@ class PairEnergy:
     def noise(self, step: int, count: int = 1) -> Tensor:
         """Standard normal noise `[B, count, 2, *latent_shape]` (float32) for both directions of each pair.
 
-        Keyed by seed, pair, step, number (of `count`) and direction: all starts of a pair meet the same.
+        It is keyed by seed, pair, step, number (of `count`) and direction, so all starts of a pair see the same noise.
         """
         number, direction = torch.arange(count)[:, None], torch.arange(2)
         return keyed_noise(self.prior, self.pairs.ids.device, self.seed, self._ids, step, number, direction)

@@ -19,7 +19,7 @@ _STARTS = 0x5747  # separates the draws of starts from a solver's own under the 
 
 
 class Starts(ABC):
-    """Makes `count` starts a pair. A constructor may declare a `model` or a `prior`, as a solver's may."""
+    """Makes `count` initial poses per pair. The constructor may declare a `model` or a `prior`, as a solver's may."""
 
     count: int
 
@@ -29,9 +29,9 @@ class Starts(ABC):
 
     @abstractmethod
     def make(self, pairs: Pairs, seed: int) -> Tensor:
-        """Starts `[B, count, 3]` (radians, radians, scene units; radius relative), float32, on the pairs' device.
+        """Relative poses `[B, count, 3]` (radians, radians, scene units), float32, on the device of the pairs.
 
-        Those of a pair depend on its images, its id and `seed` alone.
+        The starts of a pair depend on its images, its id and `seed` alone.
         """
 
 

@@ -21,15 +21,18 @@ AMBIENT = 0.2
 
 
 class View(NamedTuple):
-    """A view: pixels `[H, W, 4]` (uint8) with straight alpha, transparent where the scene is not; and, of a renderer
-    that knows it, depth `[H, W]` (float32) along the optical axis in scene units, 0 where a pixel is transparent."""
+    """A rendered view.
+
+    `pixels` `[H, W, 4]` (uint8) have straight alpha and are transparent where the scene is not. `depth` `[H, W]`
+    (float32), if the renderer provides it, is along the optical axis in scene units, 0 where a pixel is transparent.
+    """
 
     pixels: NDArray[np.uint8]
     depth: NDArray[np.float32] | None = None
 
 
 class Renderer(ABC):
-    """Draws views of scenes; pickled to worker processes, hence without state that cannot travel."""
+    """Draws views of scenes. It is pickled to worker processes, so its state has to be picklable."""
 
     name: str
 
@@ -37,9 +40,11 @@ class Renderer(ABC):
     def views(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> Iterator[View]:
-        """Views of a scene, H = W = `resolution`, from cameras `[V, 4, 4]`, OpenGL style (array or CPU tensor), one
-        after the other; what all share is set up once. The optical axis meets the image's centre. Surfaces are
-        opaque and seen from both sides. Raises `UserError` where the renderer cannot work on this machine."""
+        """Yield the views of a scene, H = W = `resolution`, from OpenGL cameras `[V, 4, 4]` (array or CPU tensor).
+
+        The optical axis passes through the image's centre. Surfaces are opaque and visible from both sides. Raises
+        `UserError` if the renderer cannot work on this machine.
+        """
 
     def render(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
