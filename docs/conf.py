@@ -9,11 +9,7 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [
-    str(ROOT),
-    str(ROOT / "docs" / "_extensions"),
-    str(ROOT / "docs" / "examples"),
-]
+sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_extensions")]
 
 project = "lp_framework"
 author = "the authors of lp_framework"

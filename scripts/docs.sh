@@ -4,5 +4,5 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh
 site="${1:-build/docs}"
-.venv/bin/python -m sphinx --fail-on-warning --keep-going --quiet docs "$site"
+.venv/bin/python -m sphinx --fail-on-warning --quiet docs "$site"
 echo "docs: open $site/index.html"

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import io
 import re
+import shlex
 import socket
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from types import ModuleType
 import pytest
 
 import lp_framework
+from lp_framework import registry
 
 pytest.importorskip("myst_nb", reason="the documentation is built with the packages of the extra docs")
 import nbformat
@@ -49,8 +51,9 @@ def test_the_site_builds_without_warning_or_network_and_is_complete(tmp_path, mo
 
     for file in [file for file in CONF.rglob("*.yaml") if file.parent != CONF]:
         folder = file.parent.relative_to(CONF)
-        page = (site / "catalogue" / f"{folder.name}.html").read_text()
-        assert f">{folder.as_posix()}={file.stem}<" in page, file
+        page = site / "catalogue" / f"{folder.name}.html"
+        assert page.exists(), f"the choices of conf/{folder} need a page docs/catalogue/{folder.name}.md"
+        assert f">{folder.as_posix()}={file.stem}<" in page.read_text(), file
     commands = (site / "catalogue" / "commands.html").read_text()
     assert [file.stem for file in CONF.glob("*.yaml") if f">{file.stem}<" not in commands] == []
 
@@ -102,6 +105,40 @@ def test_relative_links_lead_to_files(page):
     targets = re.findall(r"\]\(<?([^)>#\s]+)", text)
     missing = [each for each in targets if "://" not in each and not (page.parent / each).exists()]
     assert missing == []
+
+
+COMMAND = re.compile(r"^ *(?:\$ )?(?:OMP_NUM_THREADS=1 )?(?:python -m lp_framework|lp) ([a-z].*)", re.MULTILINE)
+VARIABLE = re.compile(r'^ *([A-Z])="(.*)"$', re.MULTILINE)
+
+
+def commands(page: Path) -> list[str]:
+    """The command lines on a page, with the values of its shell variables."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    values = dict(VARIABLE.findall(text))
+    lines = [re.sub(r"\$([A-Z])\b", lambda found: values[found[1]], line) for line in COMMAND.findall(text)]
+    return [shlex.join(shlex.split(line, comments=True)) for line in lines]
+
+
+registry.discover([DOCS / "examples"])
+PAGE_BY_LINE = {line: page.name for page in (ROOT / "README.md", *DOCS.glob("*.md")) for line in commands(page)}
+
+
+@pytest.mark.parametrize("line", sorted(PAGE_BY_LINE), ids=str)
+def test_a_command_on_a_page_has_choices_and_settings_that_exist(line, lp, tmp_path):
+    """It composes; what it does is tested elsewhere. Of a sweep the first job does."""
+    command, *arguments = shlex.split(line)
+    if command == "plugins" or any(argument.startswith("resume=") for argument in arguments):
+        return
+    (tmp_path / "docs").symlink_to(DOCS)
+    if "--multirun" in arguments:
+        arguments.remove("--multirun")
+        arguments = [argument if "[" in argument else argument.partition(",")[0] for argument in arguments]
+    finished = lp(command, *arguments, "--cfg", "job")
+    assert finished.status == 0, (PAGE_BY_LINE[line], finished.err)
+
+
+def test_the_pages_have_commands():
+    assert len(PAGE_BY_LINE) > 80
 
 
 def choices() -> ModuleType:
