@@ -111,9 +111,9 @@ def table(rows: Sequence[tuple[str, str, str]]) -> nodes.table:
             prose(comment),
         )
     group = nodes.tgroup(
-        "", *(nodes.colspec(colwidth=width) for width in (2, 2, 5)), head, body, cols=3
+        "", *(nodes.colspec(colwidth=width) for width in (3, 2, 5)), head, body, cols=3
     )
-    return nodes.table("", group, classes=["settings"])
+    return nodes.table("", group, classes=["settings", "colwidths-given"])
 
 
 def row(*cells: Sequence[nodes.Node]) -> nodes.row:
