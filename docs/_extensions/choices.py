@@ -105,11 +105,10 @@ def table(rows: Sequence[tuple[str, str, str]]) -> nodes.table:
     head, body = nodes.thead(), nodes.tbody()
     head += row(*([nodes.Text(heading)] for heading in HEADINGS))
     for key, value, comment in rows:
-        body += row(
-            [nodes.literal("", key)],
-            [nodes.literal("", value)] if value else [],
-            prose(comment),
-        )
+        default = nodes.literal("", value) if value else nodes.Text("")
+        if value == registry.MISSING:
+            default = nodes.emphasis("", "required")
+        body += row([nodes.literal("", key)], [default], prose(comment))
     group = nodes.tgroup(
         "", *(nodes.colspec(colwidth=width) for width in (3, 2, 5)), head, body, cols=3
     )
