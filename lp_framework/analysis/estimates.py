@@ -79,7 +79,9 @@ def estimate(
         View(Path(each.name), on_white(image), pose)
         for each, image, pose in zip(photographs, images, absolute.numpy(), strict=True)
     ]
-    shown = [ShownPair(f"{views[0].file.name} and {view.file.name}", "unlabelled", "", views[0], view) for view in views[1:]]
+    shown = [
+        ShownPair(f"{views[0].file.name} and {view.file.name}", "unlabelled", "", views[0], view) for view in views[1:]
+    ]
     if solution.pairs is not None:
         shown = [with_solution(pair, solution.pairs, initial, place) for place, pair in enumerate(shown)]
     return Estimate(

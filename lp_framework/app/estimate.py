@@ -244,7 +244,10 @@ def _words(result: Result) -> list[html.Div]:
     for place, pair in enumerate(result.pairs):
         relative = found.relative[place + 1].tolist()
         answer = found.answers[place] if found.answers else None
-        told: list[Any] = [html.Strong(in_words(*relative[:2])), f" from {pair.reference.file.name} to {pair.query.file.name}"]
+        told: list[Any] = [
+            html.Strong(in_words(*relative[:2])),
+            f" from {pair.reference.file.name} to {pair.query.file.name}",
+        ]
         lines = [html.P(told, className="answer")]
         if answer is not None and answer.verdict:
             lines.append(html.P(f"{answer.verdict.capitalize()}: {answer.reason}.", className="note"))
