@@ -9,18 +9,7 @@ from PIL import Image
 from lp_framework.data.procedural.labels import brand, panel
 from lp_framework.data.procedural.paint import pen, plain
 from lp_framework.data.procedural.shapes import Parts, around, body, handle, pair, stick, vessel
-from lp_framework.data.procedural.solids import (
-    Array,
-    arc,
-    box,
-    curve,
-    cylinder,
-    ellipsoid,
-    extrude,
-    lathe,
-    rod,
-    tube,
-)
+from lp_framework.data.procedural.solids import Array, arc, box, curve, cylinder, ellipsoid, extrude, lathe, rod, tube
 from lp_framework.data.procedural.textures import (
     chance,
     colour,

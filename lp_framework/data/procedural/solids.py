@@ -152,10 +152,8 @@ def plan(x: float, z: float, radius: float, y: float, count: int = 96) -> Array:
     """
     corners = [(-x / 2, -z / 2), (-x / 2, z / 2), (x / 2, z / 2), (x / 2, -z / 2)]
     outline = np.concatenate([[(0.0, -z / 2)], rounded(corners, radius, 9), [(0.0, -z / 2)]])
-    place, wanted = arc_length(outline), np.arange(count) / count
-    return np.stack(
-        [np.interp(wanted, place, outline[:, 0]), np.full(count, y), np.interp(wanted, place, outline[:, 1])], axis=1
-    )
+    ring_x, ring_z = (np.interp(np.arange(count) / count, arc_length(outline), column) for column in outline.T)
+    return np.stack([ring_x, np.full(count, y), ring_z], axis=1)
 
 
 def tube(path: ArrayLike, radius: ArrayLike, segments: int = 16, closed: bool = False) -> Shape:
@@ -176,7 +174,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 16, closed: bool = 
 
 def rod(start: ArrayLike, stop: ArrayLike, radius: float, segments: int = 12) -> Shape:
     """A straight round bar between two points."""
-    return tube(np.stack([np.asarray(start, dtype=np.float64), np.asarray(stop, dtype=np.float64)]), radius, segments)
+    return tube([start, stop], radius, segments)
 
 
 def torus(major: float, minor: float, segments: int = 40) -> Shape:
@@ -233,6 +231,7 @@ def extrude(outline: ArrayLike, depth: float, bevel: float = 0.02) -> Shape:
     rings = [np.concatenate([ring, np.full((len(ring), 1), z)], axis=1) for ring, z in levels]
     count = len(points)
     here, there = np.arange(count), (np.arange(count) + 1) % count
+    quads = np.stack([here, there, there + count, here + count], axis=1)
 
     def face(ring: Array, front: bool) -> Array:
         flat = (ring[:, :2] - low) / size
@@ -242,20 +241,16 @@ def extrude(outline: ArrayLike, depth: float, bevel: float = 0.02) -> Shape:
     shapes = []
     cap = ears(inset)
     for front, outer, inner in ((False, rings[1], rings[0]), (True, rings[2], rings[3])):
-        sides = np.concatenate(
-            [np.stack([here, there, there + count], axis=1), np.stack([here, there + count, here + count], axis=1)]
-        )
-        triangles = np.concatenate([sides, cap + count])
+        triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], cap + count])
         vertices = np.concatenate([outer, inner])
         shapes.append(Shape(vertices, face(vertices, front), triangles if front else triangles[:, ::-1]))
+    # The rim has a quad for each edge, so that the strip's ends do not meet.
+    corners = np.stack([rings[1], rings[1][there], rings[2][there], rings[2]], axis=1)
     length = arc_length(np.concatenate([points, points[:1]]))
-    for start in range(count):  # a quad an edge, so that the strip's ends do not meet
-        stop = (start + 1) % count
-        quad = np.stack([rings[1][start], rings[1][stop], rings[2][stop], rings[2][start]])
-        u0, u1 = length[start], length[start + 1]
-        uv = np.array([[u0, 0.02], [u1, 0.02], [u1, 0.22], [u0, 0.22]])
-        shapes.append(Shape(quad, uv, np.array([[0, 1, 2], [0, 2, 3]])))
-    return joined(shapes)
+    u = np.stack([length[:-1], length[1:], length[1:], length[:-1]], axis=1).ravel()
+    uv = np.stack([u, np.tile([0.02, 0.02, 0.22, 0.22], count)], axis=1)
+    triangles = (4 * here[:, None] + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
+    return joined([*shapes, Shape(corners.reshape(-1, 3), uv, triangles)])
 
 
 def inward(points: Array) -> Array:
