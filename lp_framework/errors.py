@@ -54,6 +54,21 @@ def check_settings(group: str, *settings: tuple[str, object, bool, str]) -> None
             raise UserError(f"{group}.{name} must be {wanted}, got {value}")
 
 
+def at_least(least: float, group: str, **settings: float) -> None:
+    """`UserError` for the first of a group's settings that is below `least`, or not a number.
+
+    >>> at_least(1, "solver", steps=0)
+    Traceback (most recent call last):
+    lp_framework.errors.UserError: solver.steps must be at least 1, got 0
+    """
+    check_settings(group, *((name, value, value >= least, f"at least {least}") for name, value in settings.items()))
+
+
+def positive(group: str, **settings: float) -> None:
+    """`UserError` for the first of a group's settings that is not above 0."""
+    check_settings(group, *((name, value, value > 0, "positive") for name, value in settings.items()))
+
+
 def optional_import(module: str, user: str, install: str) -> ModuleType:
     """A module of an optional package; without it a `UserError` that names its `user` and says how to `install` it."""
     try:

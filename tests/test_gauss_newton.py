@@ -249,7 +249,7 @@ def test_no_step_waits_for_the_device_or_mixes_devices(monkeypatch):
     meta = torch.device("meta")
     pairs, true = exact_pairs(2)
     there = Pairs(*(each.to(meta) for each in (pairs.images, pairs.reference, pairs.query, pairs.ids)))
-    monkeypatch.setattr("lp_framework.solvers.two_stage.check_starts", lambda pairs, starts: None)  # looks at values
+    monkeypatch.setattr("lp_framework.solvers.base.check_starts", lambda pairs, starts: None)  # looks at values
     solution = GaussNewton(ExactModel(), ExactPrior().to(meta)).refine(there, around(true, 0.3).to(meta), seed=0)
     assert solution.poses.device == meta and solution.poses.shape == (2, 1, 3)
     with pytest.raises(RuntimeError, match="device"):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lp_framework.data.pairs import PairBatch
 from lp_framework.data.photographic import CELLS
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, check_settings, positive
 from lp_framework.geometry import relative_pose
 from lp_framework.models.backbones import Backbone, EfficientNetLite0Maps, Standardise
 from lp_framework.models.matching_network import HARMONICS, SHOWN, ViewCells, ViewEncoder, Voting
@@ -76,12 +76,8 @@ class MatchingModel(PoseModel):
         seed: int = 0,
     ) -> None:
         super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
-        check_settings(
-            "model",
-            ("sigma", sigma, sigma > 0, "above 0"),
-            ("flips", flips, 0 <= flips <= 1, "in [0, 1]"),
-            ("temperature", temperature, temperature > 0, "above 0"),
-        )
+        positive("model", sigma=sigma, temperature=temperature)
+        check_settings("model", ("flips", flips, 0 <= flips <= 1, "in [0, 1]"))
         if not isinstance(backbone, EfficientNetLite0Maps):
             raise UserError("model=matching needs maps of local features: backbone=efficientnet_lite0_maps")
         self.sigma, self.kernel = sigma, PoseKernel("periodic", sigma)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least, check_settings
 from lp_framework.keyed_random import keyed_normal, keyed_uniform
 from lp_framework.models.backbones import Backbone
 from lp_framework.models.networks import PoseNetwork
@@ -104,14 +104,9 @@ class DenoisingModel(PoseModel):
         seed: int = 0,
     ) -> None:
         super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
-        check_settings(
-            "model",
-            ("hidden", hidden, hidden >= 1, "at least 1"),
-            ("layers", layers, layers >= 0, "at least 0"),
-            ("frequencies", frequencies, frequencies >= 1, "at least 1"),
-            ("dropout", dropout, 0 <= dropout < 1, "in [0, 1)"),
-            ("view_loss", view_loss, view_loss >= 0, "at least 0"),
-        )
+        at_least(1, "model", hidden=hidden, frequencies=frequencies)
+        at_least(0, "model", layers=layers, view_loss=view_loss)
+        check_settings("model", ("dropout", dropout, 0 <= dropout < 1, "in [0, 1)"))
         self.sigma, self.kernel = sigma, PoseKernel(target, sigma)
         self.noised_pose = NoisedPose(noise, sigma, noise_low, noise_high)
         self.network = PoseNetwork(

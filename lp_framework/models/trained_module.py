@@ -11,7 +11,7 @@ from lightning import LightningModule
 
 from lp_framework.data.module import FeatureExtractor
 from lp_framework.data.pairs import PairBatch
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least
 from lp_framework.models.backbones import Backbone
 
 RECIPE = "lp_framework"  # key in a checkpoint: the configs of model and backbone, by registered name
@@ -35,11 +35,7 @@ class TrainedModule(LightningModule):
         seed: int,
     ) -> None:
         super().__init__()
-        check_settings(
-            "model",
-            ("learning_rate", learning_rate, learning_rate >= 0, "at least 0"),
-            ("weight_decay", weight_decay, weight_decay >= 0, "at least 0"),
-        )
+        at_least(0, "model", learning_rate=learning_rate, weight_decay=weight_decay)
         self.backbone = backbone
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.schedule, self.seed = schedule, seed

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import wraps
+from typing import Any
 
 import torch
 from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor, nn
 
+from lp_framework.clock import now
 from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError
 from lp_framework.keyed_random import keyed_bits
@@ -91,7 +94,7 @@ class Cost:
     """The cost of a batch: the number of samples that passed a network, and seconds."""
 
     network_passes: int
-    seconds: float
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,20 @@ def check_starts(problems: Pairs | ViewSets, starts: Tensor) -> None:
         raise UserError(f"starts must be {wanted}, got {list(starts.shape)}; for one start each pass N = 1")
     if not starts.isfinite().all():
         raise UserError("starts must be finite numbers")
+
+
+def timed(solve: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator of `solve` and `solve_views`: checks the starts, allows for derivatives, fills in the seconds."""
+
+    @wraps(solve)
+    def whole(self: Solver, problems: Pairs | ViewSets, starts: Tensor, seed: int) -> Any:
+        check_starts(problems, starts)
+        began = now(starts.device)
+        with torch.inference_mode(False), torch.no_grad():
+            solution = solve(self, problems, starts, seed)
+        return replace(solution, cost=replace(solution.cost, seconds=now(starts.device) - began))
+
+    return whole
 
 
 class Solver(ABC):

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_fill_holes
 from torch import Tensor, nn
 
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
-from lp_framework.errors import UserError, check_settings, optional_import
+from lp_framework.errors import UserError, at_least, check_settings, optional_import, positive
 from lp_framework.geometry import from_opencv, inverse
 from lp_framework.keyed_random import keyed_bits
 from lp_framework.registry import register
@@ -51,17 +51,13 @@ class Features(RelativeCameraSolver):
         reference_radius: float = 1.4,
     ) -> None:
         super().__init__(reference_radius)
+        at_least(MINIMAL, "solver", fewest_inliers=fewest_inliers)
+        positive("solver", tolerance_pixels=tolerance_pixels)
+        angle = field_of_view_degrees
         check_settings(
             "solver",
             ("ratio", ratio, 0 < ratio <= 1, "in (0, 1]"),
-            ("tolerance_pixels", tolerance_pixels, tolerance_pixels > 0, "positive"),
-            ("fewest_inliers", fewest_inliers, fewest_inliers >= MINIMAL, f"at least {MINIMAL}"),
-            (
-                "field_of_view_degrees",
-                field_of_view_degrees,
-                field_of_view_degrees is None or 0 < field_of_view_degrees < 180,
-                "between 0 and 180",
-            ),
+            ("field_of_view_degrees", angle, angle is None or 0 < angle < 180, "between 0 and 180"),
         )
         if matcher == "sift" and weights is not None:
             raise UserError(f"solver.matcher=sift has no weights, got solver.weights={weights}")

@@ -13,11 +13,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from lp_framework.clock import now
-from lp_framework.errors import UserError, check_settings, optional_import
+from lp_framework.errors import UserError, optional_import, positive
 from lp_framework.geometry import from_opencv, inverse, pose_of_relative_camera, relative_camera, rigid_transform
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, timed
 
 Loaded = TypeVar("Loaded")
 
@@ -33,17 +32,15 @@ class RelativeCameraSolver(Solver):
     one_answer = True
 
     def __init__(self, reference_radius: float) -> None:
-        check_settings("solver", ("reference_radius", reference_radius, reference_radius > 0, "positive"))
+        positive("solver", reference_radius=reference_radius)
         self.reference_radius = reference_radius
 
     @abstractmethod
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
         """Relative cameras `[B, 4, 4]` (float64; NaN: none), energies `[B]`, and passes through the network."""
 
-    @torch.no_grad()
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        check_starts(pairs, starts)
-        began = now(starts.device)
         cameras, energies, passes = self.predict(pairs, seed)
         poses = pose_of_relative_camera(cameras, self.reference_radius)
         return Solution(
@@ -51,7 +48,7 @@ class RelativeCameraSolver(Solver):
             energies=energies.to(starts)[:, None],
             valid=cameras.isfinite().all(dim=-1).all(dim=-1).to(starts.device)[:, None],
             chosen=torch.zeros(len(pairs), dtype=torch.int64, device=starts.device),
-            cost=Cost(network_passes=passes, seconds=now(starts.device) - began),
+            cost=Cost(passes),
             cameras=cameras.to(starts)[:, None],
         )
 

@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot, pad
 
-from lp_framework.clock import now
-from lp_framework.errors import check_settings
+from lp_framework.errors import at_least, check_settings, positive
 from lp_framework.geometry import reduce_longitude
 from lp_framework.keyed_random import keyed_uniform, on_cpu
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, check_starts, choose
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, choose, timed
 from lp_framework.solvers.descent import GradientDescent, descend
 from lp_framework.solvers.pair_energy import PairEnergy, keyed_noise
 
@@ -58,19 +57,14 @@ class IDPose(Solver):
         averaged: int = 20,
         trajectory: bool = False,
     ) -> None:
+        at_least(1, "solver", longitudes=longitudes, probes=probes, kept=kept, averaged=averaged)
+        at_least(0, "solver", exploration_steps=exploration_steps, refinement_steps=refinement_steps)
+        positive("solver", exploration_rate=exploration_rate, refinement_rate=refinement_rate)
         check_settings(
             "solver",
-            ("longitudes", longitudes, longitudes >= 1, "at least 1"),
             ("latitudes_degrees", latitudes_degrees, len(latitudes_degrees) >= 1, "one angle or more"),
             ("timestep", timestep, 0 <= timestep < 1, "in [0, 1)"),
             ("timestep_span", timestep_span, 0 <= timestep_span <= 1 - timestep, "from 0 to 1 - timestep"),
-            ("probes", probes, probes >= 1, "at least 1"),
-            ("exploration_steps", exploration_steps, exploration_steps >= 0, "at least 0"),
-            ("exploration_rate", exploration_rate, exploration_rate > 0, "positive"),
-            ("kept", kept, kept >= 1, "at least 1"),
-            ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"),
-            ("refinement_rate", refinement_rate, refinement_rate > 0, "positive"),
-            ("averaged", averaged, averaged >= 1, "at least 1"),
         )
         self.prior, self.candidates = prior, candidates
         around = [2 * math.pi * number / longitudes for number in range(longitudes)]
@@ -86,11 +80,8 @@ class IDPose(Solver):
         """See `Solver`; between the many candidates of the exploration and the one of the refinement."""
         return 2 * self.kept
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        check_starts(pairs, starts)
-        began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
         explored, energies = self.explore(energy, starts)
         chosen, row = choose(energies), torch.arange(len(pairs), device=starts.device)
@@ -109,16 +100,13 @@ class IDPose(Solver):
             energies=energies,
             valid=valid,
             chosen=chosen,
-            cost=Cost(energy.passes, now(starts.device) - began),
+            cost=Cost(energy.passes),
             trajectory=trajectory,
         )
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
+    @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """See `Solver.solve_views`: chosen and refined together; the energies are those of the chosen candidates."""
-        check_starts(view_sets, starts)
-        began = now(starts.device)
         sets, views = view_sets.views.shape
         energy = PairEnergy(self.prior, view_sets.with_first(), seed)
         explored, alone = self.explore(energy, starts.flatten(0, 1))
@@ -137,7 +125,7 @@ class IDPose(Solver):
             poses=reduce_longitude(refined),
             energies=torch.where(energies.isnan(), energies.mT, energies),  # both directions are in each
             valid=valid & energies[:, 0, 1:].isfinite().all(dim=1),
-            cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
+            cost=Cost(energy.passes),
         )
 
     def explore(self, energy: PairEnergy, starts: Tensor) -> tuple[Tensor, Tensor]:

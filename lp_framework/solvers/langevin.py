@@ -10,8 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lp_framework.clock import now
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least
 from lp_framework.geometry import reduce_longitude, wrap_angle
 from lp_framework.keyed_random import keyed_normal
 from lp_framework.models.pose_model import PoseModel
@@ -23,9 +22,9 @@ from lp_framework.solvers.base import (
     Solver,
     ViewSets,
     ViewSolution,
-    check_starts,
     choose,
     of_first_views,
+    timed,
 )
 from lp_framework.solvers.joint_density import joint_density
 from lp_framework.solvers.progress import steps_of
@@ -61,7 +60,7 @@ class Langevin(Solver):
             raise UserError(
                 f"solver.alpha must lie between 0 and {limit:g}, twice the model's sigma^2, to converge; got {alpha}"
             )
-        check_settings("solver", ("iterations", iterations, iterations >= 0, "at least 0"))
+        at_least(0, "solver", iterations=iterations)
         if choose_by == "energy" and not model.has_energy:
             raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use distance")
         self.model = model
@@ -69,30 +68,26 @@ class Langevin(Solver):
         self.iterations, self.choose_by, self.trajectory = iterations, choose_by or model.choose_by, trajectory
         self.sigmas = None if sigma is None else _falling(sigma, iterations)
 
-    @torch.no_grad()
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start is invalid when its pose is not finite."""
-        check_starts(pairs, starts)
-        began = now(starts.device)
         codes = self.model.encode(pairs.images)
         condition = self.model.condition(codes[pairs.reference], codes[pairs.query])
-        return self._descend(condition, pairs, starts, seed, began)
+        return self._descend(condition, pairs, starts, seed)
 
-    @torch.no_grad()
+    @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """See `Solver.solve_views`. Of a model with densities, those of all ordered pairs are combined."""
         if not self.model.has_density:
             return super().solve_views(view_sets, starts, seed)
-        check_starts(view_sets, starts)
-        began = now(starts.device)
         codes = self.model.encode(view_sets.images)
         pairs = view_sets.pairs(*zip(*permutations(range(view_sets.views.shape[1]), 2), strict=True))
         condition = self.model.condition(codes[pairs.reference], codes[pairs.query])
         joint = joint_density(condition, len(view_sets), view_sets.ids, seed)
-        solution = self._descend(joint, view_sets.with_first(), starts.flatten(0, 1), seed, began)
+        solution = self._descend(joint, view_sets.with_first(), starts.flatten(0, 1), seed)
         return of_first_views(view_sets, solution)
 
-    def _descend(self, condition: Any, pairs: Pairs, starts: Tensor, seed: int, began: float) -> Solution:
+    def _descend(self, condition: Any, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         condition = condition[:, None]  # [B, 1, ...]
         noise = self._noise(pairs, starts, seed)
         pose, trajectory = starts, [starts]
@@ -111,7 +106,7 @@ class Langevin(Solver):
             energies=energies,
             valid=pose.isfinite().all(dim=-1),
             chosen=choose(energies),
-            cost=Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks, now(starts.device) - began),
+            cost=Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks),
             trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
             probability=self.model.probability(condition, pose),
         )

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lp_framework.clock import now
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least
 from lp_framework.geometry import relative_pose
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, check_starts, choose
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, choose, timed
 from lp_framework.solvers.langevin import before_second_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
@@ -65,7 +64,7 @@ class MultiView(Solver):
     ) -> None:
         if not (first_stage or second_stage):
             raise UserError("solver.first_stage and solver.second_stage cannot both be false; nothing would be left")
-        check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 1, "at least 1"))
+        at_least(1, "solver", refinement_steps=refinement_steps)
         self.model, self.prior = model, prior
         self.first_stage, self.second_stage = first_stage, second_stage
         self.first = before_second_stage(model, alpha, gamma, iterations)
@@ -74,10 +73,9 @@ class MultiView(Solver):
         )
         self.second.check(prior)
 
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`: each pair as a set of two images; one pose a pair, or one a start without first stage."""
-        check_starts(pairs, starts)
-        began = now(starts.device)
         views = torch.stack([pairs.reference, pairs.query], dim=1)
         view_sets = ViewSets(pairs.images, views, pairs.ids, pairs.field_of_view)
         joint = self._solve(view_sets, starts[:, None], seed)
@@ -87,13 +85,12 @@ class MultiView(Solver):
             energies=energies,
             valid=joint.valid,
             chosen=choose(energies.masked_fill(~joint.valid, torch.nan)),
-            cost=Cost(joint.passes, now(starts.device) - began),
+            cost=Cost(joint.passes),
         )
 
+    @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """See `Solver.solve_views`. A set is invalid when model or prior failed so that an image's pose is unknown."""
-        check_starts(view_sets, starts)
-        began = now(starts.device)
         joint = self._solve(view_sets, starts, seed)
         chosen = choose(joint.energies.nansum(dim=(-2, -1)).masked_fill(~joint.valid, torch.nan))
         sets = torch.arange(len(view_sets), device=chosen.device)
@@ -101,11 +98,9 @@ class MultiView(Solver):
             poses=joint.poses[sets, chosen],
             energies=joint.energies[sets, chosen],
             valid=joint.valid[sets, chosen],
-            cost=Cost(joint.passes, now(starts.device) - began),
+            cost=Cost(joint.passes),
         )
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
         """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
         if self.first_stage and self.model.has_density:

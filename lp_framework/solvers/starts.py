@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least, check_settings
 from lp_framework.keyed_random import keyed_uniform
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
@@ -40,7 +40,7 @@ class Ring(Starts):
     """`count` longitudes evenly around the object, at one latitude (radians); iFusion's are 0, 90, 180, 270 degrees."""
 
     def __init__(self, count: int = 4, latitude: float = 0.0) -> None:
-        check_settings("start", ("count", count, count >= 1, "at least 1"))
+        at_least(1, "start", count=count)
         self.count, self.latitude = count, latitude
 
     def make(self, pairs: Pairs, seed: int) -> Tensor:
@@ -72,11 +72,8 @@ class Random(Starts):
     """`count` starts drawn uniformly: latitude within `latitude` (radians) of 0, any longitude, relative radius 0."""
 
     def __init__(self, count: int = 4, latitude: float = math.pi / 6) -> None:
-        check_settings(
-            "start",
-            ("count", count, count >= 1, "at least 1"),
-            ("latitude", latitude, 0 <= latitude < math.pi / 2, "in [0, pi/2)"),
-        )
+        at_least(1, "start", count=count)
+        check_settings("start", ("latitude", latitude, 0 <= latitude < math.pi / 2, "in [0, pi/2)"))
         self.count, self.latitude = count, latitude
 
     def make(self, pairs: Pairs, seed: int) -> Tensor:
@@ -90,7 +87,7 @@ class Modes(Starts):
     """The `count` most likely relative poses that the model itself tells, best first (`model=matching`)."""
 
     def __init__(self, model: PoseModel, count: int = 4) -> None:
-        check_settings("start", ("count", count, count >= 1, "at least 1"))
+        at_least(1, "start", count=count)
         self.model, self.count = model, count
 
     @torch.no_grad()

@@ -15,12 +15,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from lp_framework.clock import now
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least, check_settings, positive
 from lp_framework.geometry import camera_to_world, se3_exp, view_pose
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose, timed
 from lp_framework.solvers.descent import Adam, Descended, Energy, Plateau, descend, unwrapped
 from lp_framework.solvers.pair_energy import PairEnergy
 
@@ -104,12 +103,12 @@ class DescentSettings:
     def check(self, prior: Prior) -> None:
         """`UserError` that names a setting which is out of range; timesteps are those of `prior`."""
         first, last, known = self.first_timestep, self.last_timestep, prior.num_timesteps
+        positive("solver", learning_rate=self.learning_rate)
+        at_least(0, "solver", patience=self.patience)
+        at_least(1, "solver", rescoring=self.rescoring)
         check_settings(
             "solver",
-            ("learning_rate", self.learning_rate, self.learning_rate > 0, "positive"),
             ("factor", self.factor, 0 < self.factor <= 1, "above 0 and at most 1"),
-            ("patience", self.patience, self.patience >= 0, "at least 0"),
-            ("rescoring", self.rescoring, self.rescoring >= 1, "at least 1"),
             ("last_timestep", last, 0 <= last <= first, "from 0 to first_timestep"),
             ("first_timestep", first, first < known, f"below the prior's {known} timesteps"),
         )
@@ -136,12 +135,9 @@ class TwistDescent(Solver):
         settings.check(prior)
         self.prior, self.radius_map, self.settings, self.trajectory = prior, radius_map, settings, trajectory
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
-        check_starts(pairs, starts)
-        began = now(starts.device)
         settings, energy = self.settings, PairEnergy(self.prior, pairs, seed)
 
         def of_step(poses: Tensor, step: int) -> Tensor:
@@ -161,7 +157,7 @@ class TwistDescent(Solver):
             energies=energies,
             valid=valid,
             chosen=choose(energies),
-            cost=Cost(network_passes=energy.passes, seconds=now(starts.device) - began),
+            cost=Cost(energy.passes),
             trajectory=unwrapped(trajectory) if self.trajectory else None,
         )
 
@@ -192,7 +188,7 @@ class IFusion(TwistDescent):
         fresh_noise: bool = True,
         trajectory: bool = False,
     ) -> None:
-        check_settings("solver", ("steps", steps, steps >= 1, "at least 1"))
+        at_least(1, "solver", steps=steps)
         settings = DescentSettings(
             steps, learning_rate, factor, patience, first_timestep, last_timestep, choose_by, rescoring, fresh_noise
         )

@@ -9,13 +9,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lp_framework.clock import now
-from lp_framework.errors import check_settings
+from lp_framework.errors import at_least, check_settings
 from lp_framework.geometry import reduce_longitude
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
-from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, check_starts, choose
+from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose, timed
 from lp_framework.solvers.langevin import before_second_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
@@ -49,7 +48,7 @@ class TwoStage(Solver):
         rescoring: int = 16,
         trajectory: bool = False,
     ) -> None:
-        check_settings("solver", ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"))
+        at_least(0, "solver", refinement_steps=refinement_steps)
         self.model, self.prior = model, prior
         self.first = before_second_stage(model, alpha, gamma, iterations, trajectory)
         settings = DescentSettings(
@@ -126,9 +125,9 @@ class GaussNewton(Solver):
         trajectory: bool = False,
     ) -> None:
         known = bool(timesteps) and all(0 <= each < prior.num_timesteps for each in timesteps)
+        at_least(0, "solver", refinement_steps=refinement_steps)
         check_settings(
             "solver",
-            ("refinement_steps", refinement_steps, refinement_steps >= 0, "at least 0"),
             ("timesteps", list(timesteps), known, f"one or more of 0 to {prior.num_timesteps - 1}"),
             ("damping", damping, 0 < damping < math.inf, "positive"),
         )
@@ -142,12 +141,9 @@ class GaussNewton(Solver):
         first = self.first.solve(pairs, starts, seed)
         return in_a_row(first, lambda ends: self.refine(pairs, ends, seed))
 
-    @torch.inference_mode(False)
-    @torch.no_grad()
+    @timed
     def refine(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """The second stage alone, from starts `[B, N, 3]`."""
-        check_starts(pairs, starts)
-        began = now(starts.device)
         energy = PairEnergy(self.prior, pairs, seed)
         noise = energy.noise(0, len(self.timesteps))
         pose = _plausible(starts.clone())
@@ -183,7 +179,7 @@ class GaussNewton(Solver):
             energies=energies,
             valid=valid,
             chosen=choose(energies),
-            cost=Cost(energy.passes, now(starts.device) - began),
+            cost=Cost(energy.passes),
             trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
         )
 

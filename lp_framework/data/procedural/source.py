@@ -6,7 +6,7 @@ from lp_framework.data.meshes import MeshObject
 from lp_framework.data.procedural.objects import procedural_object
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.sets.rendered import RenderedData
-from lp_framework.errors import check_settings
+from lp_framework.errors import at_least
 from lp_framework.registry import register
 
 
@@ -29,11 +29,8 @@ class ProceduralData(RenderedData):
         depth: bool = False,
         workers: int | None = None,
     ) -> None:
-        check_settings(
-            "data",
-            ("objects", objects, objects >= 1, "at least 1"),
-            ("objects_seed", objects_seed, objects_seed >= 0, "at least 0"),
-        )
+        at_least(1, "data", objects=objects)
+        at_least(0, "data", objects_seed=objects_seed)
         self.count, self.seed = objects, objects_seed
         super().__init__(
             renderer, path, workers, resolution=resolution, test_views=test_views, train_views=train_views,

@@ -11,7 +11,7 @@ from torch.nn import functional
 from lp_framework.data.files import read_json
 from lp_framework.data.module import FeatureExtractor
 from lp_framework.data.pairs import PairBatch
-from lp_framework.errors import UserError, check_settings
+from lp_framework.errors import UserError, at_least, check_settings, positive
 from lp_framework.keyed_random import keyed_bits, keyed_normal
 from lp_framework.models.backbones import Backbone
 from lp_framework.models.checkpoints import FOLDER, SHIPPED, find_checkpoint, read_checkpoint, restore
@@ -63,15 +63,10 @@ class PriorModel(TrainedModule):
         seed: int = 0,
     ) -> None:
         super().__init__(backbone, optimizer, learning_rate, weight_decay, schedule, seed)
-        check_settings(
-            "model",
-            ("latent_dim", latent_dim, 1 <= latent_dim <= 3072, "from 1 to 3072"),
-            ("scale", scale, scale > 0, "positive"),
-            ("orders", orders, orders >= 1, "at least 1"),
-            ("width", width, width >= 1, "at least 1"),
-            ("layers", layers, layers >= 0, "at least 0"),
-            ("view_loss", view_loss, view_loss >= 0, "at least 0"),
-        )
+        at_least(1, "model", orders=orders, width=width)
+        at_least(0, "model", layers=layers, view_loss=view_loss)
+        positive("model", scale=scale)
+        check_settings("model", ("latent_dim", latent_dim, 1 <= latent_dim <= 3072, "from 1 to 3072"))
         self.networks = TinyNetworks(backbone.feature_dim, latent_dim, scale, orders, width, layers)
         self.view_loss = view_loss
         self.register_buffer("alphas_cumprod", scaled_linear_alphas(), persistent=False)
