@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import torch
 from matplotlib.figure import Figure
-from torch import nn
 
 from lp_framework.analysis.fields import checked_draws
 from lp_framework.analysis.pairs import ShownPair, named_pairs
@@ -18,15 +17,11 @@ from lp_framework.errors import UserError
 from lp_framework.models.checkpoints import SHIPPED, load_model
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
-from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.base import NetworkUser, Pairs
 
 
-class PaperFigure(ABC):
+class PaperFigure(NetworkUser, ABC):
     """A figure. A subclass's constructor declares what it needs by name (`data`, `prior`) and has its settings."""
-
-    def networks(self) -> list[nn.Module]:
-        """The networks that it was given or has loaded, to be moved to a device."""
-        return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     @abstractmethod
     def analyse(self, seed: int, device: torch.device) -> Any:

@@ -26,6 +26,7 @@ class Backbone(nn.Module):
     trunk_dim: int
     feature_dim: int
     frozen: bool  # the trunk is fixed, so its features may be cached
+    trunk_name = "stem"  # of the attribute that is the trunk's network
     head: nn.Module  # [I, trunk_dim] -> [I, feature_dim]
 
     def trunk_features(self, images: Tensor) -> Tensor:
@@ -47,8 +48,9 @@ class Backbone(nn.Module):
         return self.head(self.trunk(images))
 
     def trunk_module(self) -> nn.Module:
-        """The pretrained network."""
-        raise NotImplementedError
+        """The trunk's network."""
+        network: nn.Module = getattr(self, self.trunk_name)
+        return network
 
     def fingerprint(self) -> str:
         """A hash of the trunk's class, sizes and weights, by which cached features are keyed."""
@@ -142,10 +144,6 @@ class EfficientNetLite0(Backbone):
             nn.Linear(hidden, features),
         )
 
-    def trunk_module(self) -> nn.Module:
-        """The stem and the blocks up to stride 16."""
-        return self.stem
-
     def trunk_features(self, images: Tensor) -> Tensor:
         return functional.adaptive_avg_pool2d(self.stem(images), 4).flatten(1)
 
@@ -175,10 +173,6 @@ class EfficientNetLite0Maps(Backbone):
         self.stem.eval().requires_grad_(False)
         self.head = nn.Identity()
 
-    def trunk_module(self) -> nn.Module:
-        """The stem and the blocks up to stride 32."""
-        return self.stem
-
     def trunk_features(self, images: Tensor) -> Tensor:
         """`[I, CELLS^2, trunk_dim]`, float16: 0.2 MB an image."""
         maps, x = [], images
@@ -205,9 +199,7 @@ class EfficientNetLite0Maps(Backbone):
 
 def quarters(maps: Tensor) -> Tensor:
     """`[I, 4 C, H / 2, W / 2]` of maps `[I, C, H, W]`: the four quarters of each cell, row by row, C channels each."""
-    batch, channels, height, width = maps.shape
-    cells = maps.view(batch, channels, height // 2, 2, width // 2, 2)
-    return cells.permute(0, 3, 5, 1, 2, 4).reshape(batch, 4 * channels, height // 2, width // 2)
+    return functional.pixel_unshuffle(maps, 2).unflatten(1, (-1, 4)).transpose(1, 2).flatten(1, 2)
 
 
 @register("backbone", "resnet")
@@ -217,6 +209,7 @@ class ResNet(Backbone):
     The paper's backbone is `arch=resnet50`, trained with the rest: 2048 features an image.
     """
 
+    trunk_name = "resnet"
     mean: Tensor
     std: Tensor
 
@@ -228,36 +221,27 @@ class ResNet(Backbone):
         image_size: int = 224,
     ) -> None:
         super().__init__()
-        from torchvision.models import get_model
+        from torchvision.models import get_model, get_model_weights
 
         self.image_size, self.frozen = image_size, frozen
         self.resnet = get_model(arch, weights=None)
         self.trunk_dim = self.feature_dim = self.resnet.fc.in_features
         if pretrained:
-            self._load_imagenet(arch)
+            weights = get_model_weights(arch).DEFAULT
+            try:
+                self.resnet.load_state_dict(weights.get_state_dict(progress=True, check_hash=True))
+            except OSError as error:  # URLError among them
+                warnings.warn(
+                    f"the ImageNet weights of {arch} cannot be had ({error}); training starts from random weights. "
+                    f"Put {weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints to use them.",
+                    stacklevel=2,
+                )
         self.resnet.fc = nn.Identity()
         self.head = nn.Identity()
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         if frozen:
             self.resnet.eval().requires_grad_(False)
-
-    def _load_imagenet(self, arch: str) -> None:
-        from torchvision.models import get_model_weights
-
-        weights = get_model_weights(arch).DEFAULT
-        try:
-            self.resnet.load_state_dict(weights.get_state_dict(progress=True, check_hash=True))
-        except OSError as error:  # URLError among them
-            warnings.warn(
-                f"the ImageNet weights of {arch} cannot be had ({error}); training starts from random weights. "
-                f"Put {weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints to use them.",
-                stacklevel=2,
-            )
-
-    def trunk_module(self) -> nn.Module:
-        """The ResNet without its classifier."""
-        return self.resnet
 
     def trunk_features(self, images: Tensor) -> Tensor:
         return self.resnet(((images + 1) / 2 - self.mean) / self.std)

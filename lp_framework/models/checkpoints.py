@@ -21,12 +21,11 @@ from typing import Any
 import torch
 from lightning.pytorch import callbacks
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from lp_framework import registry
 from lp_framework.atomic import written
-from lp_framework.data.files import read_json, written_folder
+from lp_framework.data.files import expecting, read_json, written_folder
 from lp_framework.errors import UserError, one_line, optional_import
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.models.trained_module import RECIPE, TrainedModule
@@ -89,41 +88,23 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     except Exception as error:  # a damaged pickle fails in any way
         message = f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
         raise UserError(message) from error
-    weights = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
-    if (
-        not isinstance(weights, dict)
-        or not _is_recipe(checkpoint.get(RECIPE))
-        or not all(isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in weights.items())
-    ):
+    if not isinstance(checkpoint, dict) or not {RECIPE, "state_dict"} <= checkpoint.keys():
         raise UserError(f"{path}: is a checkpoint of something else; one that `lp train` wrote is wanted")
     return checkpoint
 
 
 def _read_folder(folder: Path) -> dict[str, Any]:
     """The checkpoint that a folder holds, weights in float32; `UserError` naming the file that is at fault."""
-    config = read_json(folder / CONFIG)
-    if not _is_recipe(config):
-        raise UserError(f"{folder / CONFIG}: is not the description of a trained model and its backbone")
-    try:
-        with safe_open(folder / WEIGHTS, framework="pt") as file:
-            weights = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a mapping)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{folder / WEIGHTS}: is not a readable file of weights ({error})") from error
+    with expecting(f"{folder / CONFIG}: is not the description of a trained model and its backbone"):
+        config = dict(read_json(folder / CONFIG))
+        recipe = {"model": config["model"], "backbone": config["backbone"]}
+    with expecting(f"{folder / WEIGHTS}: is not a readable file of weights"):
+        weights = load_file(folder / WEIGHTS)
     return {
-        RECIPE: {"model": config["model"], "backbone": config["backbone"]},
+        RECIPE: recipe,
         "trunk": config.get("trunk"),
         "state_dict": {key: each.float() if each.is_floating_point() else each for key, each in weights.items()},
     }
-
-
-def _is_recipe(value: Any) -> bool:
-    """Whether a value has the configs of model and backbone: settings by name, `name` among them."""
-    return isinstance(value, dict) and all(
-        isinstance(value.get(group), dict)
-        and isinstance(value[group].get("name"), str)
-        and all(isinstance(key, str) for key in value[group])
-        for group in ("model", "backbone")
-    )
 
 
 def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtype: torch.dtype) -> None:
@@ -212,11 +193,11 @@ def load_model(path: str | Path) -> PoseModel:
 
 def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
     """The trained module that a checkpoint (see `read_checkpoint`) holds; `file` names it in errors."""
-    recipe = checkpoint[RECIPE]
-    kind, settings = recipe["model"]["name"], dict(recipe["backbone"])
-    if settings.get("pretrained") and not settings.get("frozen"):
-        settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
     try:
+        recipe = checkpoint[RECIPE]
+        settings = dict(recipe["backbone"])
+        if settings.get("pretrained") and not settings.get("frozen"):
+            settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
         backbone = registry.build("backbone", settings)
         model: TrainedModule = registry.build("model", recipe["model"], backbone=backbone)
         model.on_load_checkpoint(checkpoint)
@@ -227,7 +208,7 @@ def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
         raise UserError(f"{file}: describes no model that can be built ({reason})") from error
     try:
         model.load_state_dict(checkpoint["state_dict"])
-    except RuntimeError as error:
-        reason = shorten(str(error).splitlines()[1], 200, placeholder=" ...")
-        raise UserError(f"{file}: its weights are of another {kind} model: {reason}") from error
+    except Exception as error:  # of tensors that do not fit, or of what are no tensors
+        reason = shorten(" ".join(str(error).splitlines()[1:2]), 200, placeholder=" ...")
+        raise UserError(f"{file}: its weights are of another {recipe['model']['name']} model: {reason}") from error
     return model.eval().requires_grad_(False)

@@ -169,10 +169,11 @@ class MatchingModel(PoseModel):
         density = self._density(views[reference], views[query])
         true = relative_pose(poses[reference], poses[query])
         cropped = batch.cropped.to(reference.device)
+        placed = (poses[:, ::2] - poses.new_tensor([0.0, MEAN_RADIUS])) / self.pose_scale
         losses = {
             "longitude": -density.log_prob(true[:, 1]).mean(),
             "shift": 0.5 * self._shift_loss(density, true, cropped[reference] | cropped[query]),
-            "view": 0.5 * self._view_loss(views, poses, cropped),
+            "view": 0.5 * _mean_without_crops_radii((views.pose - placed).abs(), cropped),
             **self._geometry_losses(views, told_points, _taken(points, cells), poses, reference, query),
         }
         for name, value in losses.items():
@@ -215,10 +216,6 @@ class MatchingModel(PoseModel):
         deviation = density.deviation / self.pose_scale
         loss = 0.5 * (offset / deviation).square() + deviation.log() + offset.abs()
         return _mean_without_crops_radii(loss, cropped)
-
-    def _view_loss(self, views: ViewCells, poses: Tensor, cropped: Tensor) -> Tensor:
-        scaled = (poses[:, ::2] - poses.new_tensor([0.0, MEAN_RADIUS])) / self.pose_scale
-        return _mean_without_crops_radii((views.pose - scaled).abs(), cropped)
 
     def _geometry_losses(
         self, views: ViewCells, told: Tensor, points: Tensor, poses: Tensor, reference: Tensor, query: Tensor

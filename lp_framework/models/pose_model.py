@@ -126,10 +126,6 @@ class DenoisingModel(PoseModel):
         return self.network.project(reference, query)
 
     @abstractmethod
-    def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
-        """Score (and energy) at relative poses `[..., 3]` for conditions `[..., hidden]`, at the model's `sigma`."""
-
-    @abstractmethod
     def pair_loss(self, condition: Tensor, noised: Tensor, true: Tensor) -> Tensor:
         """The objective for each noised pose `[...]`."""
 

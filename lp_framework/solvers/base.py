@@ -174,15 +174,19 @@ def timed(solve: Callable[..., Any]) -> Callable[..., Any]:
     return whole
 
 
-class Solver(ABC):
+class NetworkUser:
+    """What is given networks (models, priors) or loads them, and keeps them as its attributes."""
+
+    def networks(self) -> list[nn.Module]:
+        """The networks, to be moved to a device."""
+        return [part for part in vars(self).values() if isinstance(part, nn.Module)]
+
+
+class Solver(NetworkUser, ABC):
     """Estimates relative poses. A subclass's constructor declares what it needs by name: `model`, `prior`."""
 
     one_answer = False  # it ignores starts and has one answer a pair: a success rate over starts is none
     field_of_view_degrees: float | None = None  # of all images, where it was told one
-
-    def networks(self) -> list[nn.Module]:
-        """The networks that it was given, to be moved to a device."""
-        return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     def samples_per_pair(self, starts: int) -> int:
         """Number of samples per pair that pass the prior at once: both directions of each start."""

@@ -114,7 +114,7 @@ class IDPose(Solver):
         duos = list(combinations(range(views - 1), 2))
         between = self.energies_between(energy, view_sets, poses, duos)
         chosen = triangular_choice(alone, between, duos)
-        selected = torch.take_along_dim(poses, chosen[..., None, None], dim=2).squeeze(2)
+        selected = poses.take_along_dim(chosen[..., None, None], dim=2).squeeze(2)
         refined, valid, _ = self.refine(energy, view_sets.views, view_sets.ids, selected)
         energies = alone.new_full((sets, views, views), torch.nan)
         energies[:, 0, 1:] = alone.gather(2, chosen[..., None]).squeeze(-1)
@@ -135,7 +135,7 @@ class IDPose(Solver):
         poses = starts.clone() if given else starts.new_tensor(self.grid).repeat(len(starts), 1, 1)
         noise = energy.noise(self.exploration_steps, len(self.probe_timesteps))
         probed = energy.mean(poses, self.probe_timesteps, noise)
-        poses = _take(poses, _order(probed)[:, : max(1, poses.shape[1] // 2)])
+        poses = poses.take_along_dim(_order(probed)[:, : max(1, poses.shape[1] // 2), None], dim=1)
 
         def one_direction(poses: Tensor, step: int) -> Tensor:
             pairs, noise = energy.pairs, energy.noise(step)[:, 0, step % 2]
@@ -148,7 +148,7 @@ class IDPose(Solver):
         trajectory = trajectory[:, :, : max(1, steps)]  # as published, what counts is the last pose before an update
         probed = energy.mean(trajectory[:, :, -1], self.probe_timesteps, noise).masked_fill(~valid, torch.nan)
         best = _order(probed)[:, : self.kept]
-        return _take(trajectory, best), probed.gather(1, best)
+        return trajectory.take_along_dim(best[..., None, None], dim=1), probed.gather(1, best)
 
     def energies_between(
         self, energy: PairEnergy, view_sets: ViewSets, poses: Tensor, duos: Sequence[tuple[int, int]]
@@ -237,8 +237,3 @@ def triangular_choice(alone: Tensor, between: Tensor, duos: Sequence[tuple[int, 
 def _order(energies: Tensor) -> Tensor:
     """Indices `[B, N]` from the least energy `[B, N]` to the largest; what is not finite comes last."""
     return energies.nan_to_num(nan=torch.inf).argsort(dim=1, stable=True)
-
-
-def _take(values: Tensor, index: Tensor) -> Tensor:
-    """Of `[B, N, ...]` those at `[B, K]`."""
-    return values[torch.arange(len(values), device=values.device)[:, None], index]

@@ -28,7 +28,7 @@ def joint_density(density: PoseDensity, sets: int, ids: Tensor, seed: int) -> Po
     (by reference, then query); `ids` `[S]` of the sets, by which `seed` draws."""
     views = round((1 + math.sqrt(1 + 4 * len(density.logits) / sets)) / 2)
     told = _table(density.logits.log_softmax(dim=-1), sets, views)
-    told = (told + _reversed(told.transpose(1, 2))) / 2
+    told = (told + told.transpose(1, 2).flip(-1).roll(1, -1)) / 2  # with the other order's, of negative longitudes
     places = _climbed(told, _drawn(told, ids, seed))
     mean, deviation = _agreed(
         _table(density.mean, sets, views), _table(density.deviation.square().reciprocal(), sets, views)
@@ -42,11 +42,6 @@ def _table(values: Tensor, sets: int, views: int) -> Tensor:
     off = ~torch.eye(views, dtype=torch.bool, device=values.device)
     table[:, off] = values.unflatten(0, (sets, -1))
     return table
-
-
-def _reversed(density: Tensor) -> Tensor:
-    """Log-densities `[..., GRID]` of the longitudes' negatives."""
-    return density.flip(-1).roll(1, -1)
 
 
 def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:

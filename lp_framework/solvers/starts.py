@@ -7,25 +7,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lp_framework.errors import UserError, at_least, check_settings
 from lp_framework.keyed_random import keyed_uniform
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
-from lp_framework.solvers.base import Pairs
+from lp_framework.solvers.base import NetworkUser, Pairs
 
 _STARTS = 0x5747  # separates the draws of starts from a solver's own under the same seed
 
 
-class Starts(ABC):
+class Starts(NetworkUser, ABC):
     """Makes `count` initial poses per pair. The constructor may declare a `model` or a `prior`, as a solver's may."""
 
     count: int
-
-    def networks(self) -> list[nn.Module]:
-        """The networks that they were given, to be moved to a device."""
-        return [part for part in vars(self).values() if isinstance(part, nn.Module)]
 
     @abstractmethod
     def make(self, pairs: Pairs, seed: int) -> Tensor:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from safetensors.torch import save_file
 
-from lp_framework.data.files import read_json, written_folder
+from lp_framework.data.files import expecting, read_json, written_folder
 from lp_framework.errors import UserError, one_line
 from lp_framework.priors.zero123.networks import Configs, Dtype, Networks, Weights, assemble, packages
 from lp_framework.priors.zero123.original import Averages, read_original
@@ -99,19 +99,12 @@ def _weights(folder: Path) -> dict[str, StoredTensor]:
     if file is None:
         raise UserError(f"{folder}: holds no weights, none of {', '.join(WEIGHT_FILES)}")
     read = read_state_dict if file.suffix == ".bin" else read_safetensors
-    tensors = {name: stored for each in _shards(file) for name, stored in read(each).items()}
+    files = [file]
+    if file.suffix == ".json":  # the index of weights in several files
+        with expecting(f"{file}: names no files of weights; download it again"):
+            files = [file.with_name(name) for name in sorted({*read_json(file)["weight_map"].values()})]
+    tensors = {name: stored for each in files for name, stored in read(each).items()}
     return {name: stored for name, stored in tensors.items() if name not in LEFT_OVER}
-
-
-def _shards(file: Path) -> list[Path]:
-    """The files of weights that an index names, or the file itself."""
-    if file.suffix != ".json":
-        return [file]
-    index = read_json(file)
-    owners = index.get("weight_map") if isinstance(index, dict) else None
-    if not isinstance(owners, dict) or not owners:
-        raise UserError(f"{file}: names no files of weights; download it again")
-    return [file.with_name(name) for name in sorted({*map(str, owners.values())})]
 
 
 def write_folder(networks: Networks, path: Path) -> None:
