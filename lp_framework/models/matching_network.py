@@ -125,16 +125,8 @@ class ViewEncoder(nn.Module):
         place = torch.stack([cells % CELLS, cells // CELLS], dim=-1) * (2 / (CELLS - 1)) - 1
         moments = torch.cat([place, points.detach(), torch.ones_like(shown)], dim=-1)
         gates = self.gates(x).float().sigmoid() * shown
-        view = ViewCells(
-            descriptor,
-            self.azimuth(x).float(),
-            gates,
-            moments * shown,
-            shown,
-            pooled.float(),
-            self.pose(pooled).float(),
-        )
-        return view, points
+        azimuth, pose = self.azimuth(x).float(), self.pose(pooled).float()
+        return ViewCells(descriptor, azimuth, gates, moments * shown, shown, pooled.float(), pose), points
 
 
 class Voting(nn.Module):

@@ -214,10 +214,5 @@ def of_first_views(view_sets: ViewSets, solution: Solution) -> ViewSolution:
     chosen = solution.chosen[:, None]
     energies = solution.energies.new_full((sets, views, views), torch.nan)
     energies[:, 0, 1:] = solution.energies.gather(1, chosen).view(sets, views - 1)
-    return ViewSolution(
-        poses=solution.answer().view(sets, views - 1, 3),
-        energies=energies,
-        valid=solution.valid.gather(1, chosen).view(sets, views - 1).all(dim=1),
-        cost=solution.cost,
-        pairs=solution,
-    )
+    valid = solution.valid.gather(1, chosen).view(sets, views - 1).all(dim=1)
+    return ViewSolution(solution.answer().view(sets, views - 1, 3), energies, valid, solution.cost, solution)

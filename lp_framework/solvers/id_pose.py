@@ -95,14 +95,7 @@ class IDPose(Solver):
             rest = explored[:, :, -1:].repeat(1, 1, steps.shape[1] - 1, 1)
             rest[row, chosen] = steps[:, 1:, 0]
             trajectory = torch.cat([explored, rest], dim=2)
-        return Solution(
-            poses=reduce_longitude(ends),
-            energies=energies,
-            valid=valid,
-            chosen=chosen,
-            cost=Cost(energy.passes),
-            trajectory=trajectory,
-        )
+        return Solution(reduce_longitude(ends), energies, valid, chosen, Cost(energy.passes), trajectory=trajectory)
 
     @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
@@ -121,12 +114,9 @@ class IDPose(Solver):
         row = torch.arange(sets, device=chosen.device)
         for number, (i, j) in enumerate(duos):
             energies[:, i + 1, j + 1] = between[row, number, chosen[:, i], chosen[:, j]]
-        return ViewSolution(
-            poses=reduce_longitude(refined),
-            energies=torch.where(energies.isnan(), energies.mT, energies),  # both directions are in each
-            valid=valid & energies[:, 0, 1:].isfinite().all(dim=1),
-            cost=Cost(energy.passes),
-        )
+        valid = valid & energies[:, 0, 1:].isfinite().all(dim=1)
+        energies = torch.where(energies.isnan(), energies.mT, energies)  # both directions are in each
+        return ViewSolution(reduce_longitude(refined), energies, valid, Cost(energy.passes))
 
     def explore(self, energy: PairEnergy, starts: Tensor) -> tuple[Tensor, Tensor]:
         """The trajectories `[B, K, steps, 3]` of the K best candidates, best first, and their probed energies `[B, K]`

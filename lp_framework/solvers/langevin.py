@@ -101,15 +101,11 @@ class Langevin(Solver):
             trajectory.append(pose)
         energies = self._energies(condition, pose)
         looks = self.iterations + {"distance": 3, "energy": 1, "agreement": 0}[self.choose_by]
-        return Solution(
-            poses=reduce_longitude(pose),
-            energies=energies,
-            valid=pose.isfinite().all(dim=-1),
-            chosen=choose(energies),
-            cost=Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks),
-            trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
-            probability=self.model.probability(condition, pose),
-        )
+        cost = Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks)
+        path = torch.stack(trajectory, dim=2) if self.trajectory else None
+        within = self.model.probability(condition, pose)
+        valid, chosen = pose.isfinite().all(dim=-1), choose(energies)
+        return Solution(reduce_longitude(pose), energies, valid, chosen, cost, trajectory=path, probability=within)
 
     def _noise(self, pairs: Pairs, starts: Tensor, seed: int) -> Tensor:
         """The noise gamma z_t of every start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""

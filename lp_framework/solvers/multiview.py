@@ -80,13 +80,8 @@ class MultiView(Solver):
         view_sets = ViewSets(pairs.images, views, pairs.ids, pairs.field_of_view)
         joint = self._solve(view_sets, starts[:, None], seed)
         energies = (joint.energies[..., 0, 1] + joint.energies[..., 1, 0]) / 2
-        return Solution(
-            poses=joint.poses[:, :, 0],
-            energies=energies,
-            valid=joint.valid,
-            chosen=choose(energies.masked_fill(~joint.valid, torch.nan)),
-            cost=Cost(joint.passes),
-        )
+        chosen = choose(energies.masked_fill(~joint.valid, torch.nan))
+        return Solution(joint.poses[:, :, 0], energies, joint.valid, chosen, Cost(joint.passes))
 
     @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
@@ -94,12 +89,8 @@ class MultiView(Solver):
         joint = self._solve(view_sets, starts, seed)
         chosen = choose(joint.energies.nansum(dim=(-2, -1)).masked_fill(~joint.valid, torch.nan))
         sets = torch.arange(len(view_sets), device=chosen.device)
-        return ViewSolution(
-            poses=joint.poses[sets, chosen],
-            energies=joint.energies[sets, chosen],
-            valid=joint.valid[sets, chosen],
-            cost=Cost(joint.passes),
-        )
+        poses, energies, valid = (each[sets, chosen] for each in (joint.poses, joint.energies, joint.valid))
+        return ViewSolution(poses, energies, valid, Cost(joint.passes))
 
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
         """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
@@ -165,18 +156,13 @@ class MultiView(Solver):
         twist = initial.poses.new_zeros(*initial.poses.shape[:2], others * 6)
         trajectory, _, valid = settings.descend(of_step, pose_of, twist)
         ends_of_all, noise = trajectory[:, :, -1], energy.noise(settings.steps, settings.rescoring)
-        directed = torch.stack(
-            [
-                energy.residual(relative(ends_of_all), timestep, noise[:, number]).square().mean(dim=-1)
-                for number, timestep in enumerate(settings.rescoring_timesteps())
-            ]
-        ).mean(dim=0)
+        residuals = (
+            energy.residual(relative(ends_of_all), timestep, noise[:, number])
+            for number, timestep in enumerate(settings.rescoring_timesteps())
+        )
+        directed = torch.stack([each.square().mean(dim=-1) for each in residuals]).mean(dim=0)
         directed = directed.unflatten(0, (sets, -1)).transpose(1, 2)  # [S, N, pairs, 2]
         energies = torch.full_like(initial.energies, torch.nan)
         energies[:, :, first, second], energies[:, :, second, first] = directed.unbind(dim=-1)
-        return Joint(
-            poses=ends_of_all.unflatten(-1, (others, 3)),
-            energies=energies,
-            valid=initial.valid & valid & directed.isfinite().all(dim=-1).all(dim=-1),
-            passes=initial.passes + energy.passes,
-        )
+        valid = initial.valid & valid & directed.isfinite().all(dim=-1).all(dim=-1)
+        return Joint(ends_of_all.unflatten(-1, (others, 3)), energies, valid, initial.passes + energy.passes)

@@ -152,14 +152,8 @@ class TwistDescent(Solver):
             energies = energy.mean(ends, settings.rescoring_timesteps(), noise)
             valid = valid & energies.isfinite()
         energies = energies.masked_fill(~valid, torch.nan)
-        return Solution(
-            poses=ends,
-            energies=energies,
-            valid=valid,
-            chosen=choose(energies),
-            cost=Cost(energy.passes),
-            trajectory=unwrapped(trajectory) if self.trajectory else None,
-        )
+        path = unwrapped(trajectory) if self.trajectory else None
+        return Solution(ends, energies, valid, choose(energies), Cost(energy.passes), trajectory=path)
 
 
 @register("solver", "ifusion")
@@ -169,9 +163,6 @@ class IFusion(TwistDescent):
     Defaults are the published settings; its starts are `ring`. The plateau schedule is fed with the accumulated loss,
     as in the published code, so the rate is multiplied by `factor` after the first `patience` + 2 steps and then every
     `patience` + 1. Left out: the published code drops each condition in 5% of the steps.
-
-    `choose_by`: `accumulated`, the least sum of the losses on the way (published); `rescored`, the least mean error of
-    the final poses on `rescoring` noises and timesteps that are the same for all starts of a pair.
     """
 
     def __init__(

@@ -56,6 +56,7 @@ class TwoStage(Solver):
         )
         self.second = TwistDescent(prior, TanhRadius(), settings, trajectory)
 
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start is invalid when the model or the prior failed on its way."""
         first = self.first.solve(pairs, starts, seed)
@@ -72,14 +73,10 @@ def in_a_row(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
     # A start that failed goes along at the origin, so that the others stay in their places.
     after = second(first.poses.masked_fill(~first.valid[..., None], 0.0))
     energies = after.energies.masked_fill(~first.valid, torch.nan)
-    return Solution(
-        poses=torch.where(first.valid[..., None], after.poses, first.poses),
-        energies=energies,
-        valid=first.valid & after.valid,
-        chosen=choose(energies),
-        cost=Cost(first.cost.network_passes + after.cost.network_passes, first.cost.seconds + after.cost.seconds),
-        trajectory=_joined(first.trajectory, after.trajectory),
-    )
+    poses = torch.where(first.valid[..., None], after.poses, first.poses)
+    cost = Cost(first.cost.network_passes + after.cost.network_passes)
+    path = _joined(first.trajectory, after.trajectory)
+    return Solution(poses, energies, first.valid & after.valid, choose(energies), cost, trajectory=path)
 
 
 def _joined(first: Tensor | None, second: Tensor | None) -> Tensor | None:
@@ -136,6 +133,7 @@ class GaussNewton(Solver):
         self.steps, self.timesteps, self.damping = refinement_steps, list(timesteps), damping
         self.trajectory = trajectory
 
+    @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. Energies are those descended; a start is invalid when the model or the prior failed."""
         first = self.first.solve(pairs, starts, seed)
@@ -174,14 +172,8 @@ class GaussNewton(Solver):
             trajectory.append(pose)
         valid = here.energy.isfinite() & here.gradient.isfinite().all(dim=-1)
         energies = here.energy.masked_fill(~valid, torch.nan)
-        return Solution(
-            poses=reduce_longitude(pose),
-            energies=energies,
-            valid=valid,
-            chosen=choose(energies),
-            cost=Cost(energy.passes),
-            trajectory=torch.stack(trajectory, dim=2) if self.trajectory else None,
-        )
+        path = torch.stack(trajectory, dim=2) if self.trajectory else None
+        return Solution(reduce_longitude(pose), energies, valid, choose(energies), Cost(energy.passes), trajectory=path)
 
     def _quadratic(self, energy: PairEnergy, pose: Tensor, noise: Tensor) -> Quadratic:
         """Energy, gradient and Hessian at poses `[B, N, 3]`; noise `[B, timesteps, 2, *latent_shape]`."""

@@ -94,11 +94,8 @@ class EnergyAndSlope(torch.autograd.Function):
 class Zero123Prior(Prior):
     """Zero123's four networks, in whatever dtype; poses, their projection and energies are float32 in any case.
 
-    - `channels_last`, `compile`: memory layout of the U-Net, and `torch.compile` of it (slow at the first call).
-    - `cuda_graph`: on a GPU, the energy and its gradient are recorded once for each size of a batch and then replayed,
-      which spares the host a thousand launches a step; worth it for few starts, on which a GPU waits for the host.
-    - `attention`: `sdpa` is PyTorch's fused attention, `math` its plain one, which can be differentiated twice.
-    - `max_batch`: samples that pass a network at once; more are split. On a GPU that runs out of memory it is halved.
+    With `cuda_graph` the energy and its gradient are recorded once for each size of a batch and then replayed, which
+    spares the host a thousand launches a step. On a GPU that runs out of memory `max_batch` is halved.
     """
 
     alphas_cumprod: Tensor
