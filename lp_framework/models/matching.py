@@ -118,9 +118,8 @@ class MatchingModel(PoseModel):
 
     def modes(self, condition: PoseDensity, count: int) -> Tensor:
         """The highest maxima of the longitude's density, at the latitude's and radius's means, `[P, count, 3]`."""
-        longitude, _ = condition.modes(count)
         latitude, radius = condition.mean[:, None].expand(-1, count, -1).unbind(dim=-1)
-        return torch.stack([latitude, longitude, radius], dim=-1)
+        return torch.stack([latitude, condition.modes(count), radius], dim=-1)
 
     def _encode(self, maps: Tensor) -> ViewCells:
         maps = maps.float()  # cached as float16, which autocast to bfloat16 does not stack

@@ -71,8 +71,8 @@ class PoseDensity:
         value = (weight * (harmonics.real * phase.cos() - harmonics.imag * phase.sin())).sum(dim=-1)
         return value - self.logits.logsumexp(dim=-1) - math.log(2 * math.pi / GRID)
 
-    def modes(self, count: int) -> tuple[Tensor, Tensor]:
-        """The `count` highest local maxima: longitudes `[P, count]` and the probability of lying within 30 degrees.
+    def modes(self, count: int) -> Tensor:
+        """The longitudes `[P, count]` of the highest local maxima.
 
         Where there are fewer, the highest again. The place between the grid's longitudes is that of a parabola's top.
         """
@@ -82,8 +82,7 @@ class PoseDensity:
         places = torch.where(heights.isfinite(), places, places[..., :1])
         left, middle, right = (each.gather(-1, places) for each in (behind, self.logits, ahead))
         shift = 0.5 * (left - right) / (left - 2 * middle + right).clamp(max=-1e-6)
-        longitudes = torch.remainder((places + shift.clamp(-0.5, 0.5)) * (2 * math.pi / GRID), 2 * math.pi)
-        return longitudes, self.probability_near(places)
+        return torch.remainder((places + shift.clamp(-0.5, 0.5)) * (2 * math.pi / GRID), 2 * math.pi)
 
     def probability(self, pose: Tensor, degrees: float) -> Tensor:
         """That the true rotation lies within so many degrees of those of relative poses `[..., 3]`, `[...]`.
@@ -99,16 +98,6 @@ class PoseDensity:
         off, spread = pose[..., :1] - self.mean[..., :1], math.sqrt(2) * self.deviation[..., :1]
         band = (((off + half) / spread).erf() - ((off - half) / spread).erf()) / 2
         return (self.probabilities * band).sum(dim=-1)
-
-    def probability_near(self, places: Tensor, degrees: float = 30.0) -> Tensor:
-        """Of longitudes within so many degrees of places `[..., M]` of the grid."""
-        reach = round(degrees / 360 * GRID)
-        offsets = torch.arange(-reach, reach + 1, device=places.device)
-        weights = torch.ones(len(offsets), device=places.device)
-        weights[0] = weights[-1] = 0.5
-        near = (places[..., None] + offsets) % GRID
-        mass = self.probabilities[..., None, :].expand(*places.shape, GRID).gather(-1, near)
-        return (mass * weights).sum(dim=-1)
 
 
 def from_bins(logits: Tensor) -> Tensor:

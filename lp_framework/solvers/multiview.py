@@ -19,7 +19,7 @@ from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, V
 from lp_framework.solvers.langevin import before_second_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
-from lp_framework.solvers.twist import DescentSettings, TanhRadius, TwistPoses
+from lp_framework.solvers.twist import TwistDescent, TwistPoses
 
 NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model does not tell it
 
@@ -68,10 +68,8 @@ class MultiView(Solver):
         self.model, self.prior = model, prior
         self.first_stage, self.second_stage = first_stage, second_stage
         self.first = before_second_stage(model, alpha, gamma, iterations)
-        self.second = DescentSettings(
-            refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, "rescored", rescoring
-        )
-        self.second.check(prior)
+        schedule = (refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep)
+        self.second = TwistDescent(prior, *schedule, rescoring=rescoring)
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
@@ -132,12 +130,11 @@ class MultiView(Solver):
 
     def refine(self, view_sets: ViewSets, initial: Joint, seed: int) -> Joint:
         """3. Joint descent (Eq. 5) from N sets of poses at once, by a twist for each image but the first."""
-        settings = self.second
         sets, _, others, _ = initial.poses.shape
         ends = list(zip(*combinations(range(others + 1), 2), strict=True))
         energy = PairEnergy(self.prior, view_sets.pairs(*ends), seed)  # both directions of an unordered pair
         first, second = torch.tensor(ends, device=initial.poses.device)
-        to_poses = TwistPoses(initial.poses, TanhRadius())
+        to_poses = TwistPoses(initial.poses, self.second.radius_map)
 
         def pose_of(twist: Tensor) -> Tensor:
             """Poses `[S, N, (V - 1) x 3]` of twists `[S, N, (V - 1) x 6]`."""
@@ -150,15 +147,15 @@ class MultiView(Solver):
 
         def of_step(poses: Tensor, step: int) -> Tensor:
             """The sum over ordered pairs, `[S, N]`."""
-            energies = energy(relative(poses), settings.timestep(step / settings.steps), energy.noise(step)[:, 0])
+            energies = energy(relative(poses), self.second.timestep(step / self.second.steps), energy.noise(step)[:, 0])
             return 2 * energies.unflatten(0, (sets, -1)).sum(dim=1)
 
         twist = initial.poses.new_zeros(*initial.poses.shape[:2], others * 6)
-        trajectory, _, valid = settings.descend(of_step, pose_of, twist)
-        ends_of_all, noise = trajectory[:, :, -1], energy.noise(settings.steps, settings.rescoring)
+        trajectory, _, valid = self.second.descend(of_step, pose_of, twist)
+        ends_of_all, noise = trajectory[:, :, -1], energy.noise(self.second.steps, self.second.rescoring)
         residuals = (
             energy.residual(relative(ends_of_all), timestep, noise[:, number])
-            for number, timestep in enumerate(settings.rescoring_timesteps())
+            for number, timestep in enumerate(self.second.rescoring_timesteps())
         )
         directed = torch.stack([each.square().mean(dim=-1) for each in residuals]).mean(dim=0)
         directed = directed.unflatten(0, (sets, -1)).transpose(1, 2)  # [S, N, pairs, 2]

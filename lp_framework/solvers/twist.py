@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -86,23 +86,29 @@ class TwistPoses:
         return torch.stack([latitude + self.rest, longitude, self.radius_map.radius(norm)], dim=-1)
 
 
-@dataclass(frozen=True)
-class DescentSettings:
-    """How Adam descends a prior's energy; the solvers' settings of the same names, see `ifusion`."""
+@dataclass(eq=False)
+class TwistDescent(Solver):
+    """iFusion's descent of the prior's energy from every start: twists by Adam, the timestep falling with the step.
 
-    steps: int
-    learning_rate: float
-    factor: float
-    patience: int
-    first_timestep: int
-    last_timestep: int
-    choose_by: ChooseBy
-    rescoring: int
+    `choose_by`: `accumulated`, the least sum of the losses on the way (published); `rescored`, the least mean error of
+    the final poses on `rescoring` noises and timesteps that are the same for all starts of a pair.
+    """
+
+    prior: Prior
+    steps: int = 100
+    learning_rate: float = 0.1
+    factor: float = 0.6
+    patience: int = 10
+    first_timestep: int = 999
+    last_timestep: int = 0
+    choose_by: ChooseBy = "accumulated"
+    rescoring: int = 16
     fresh_noise: bool = True
+    trajectory: bool = False
+    radius_map: ClassVar[RadiusMap] = TanhRadius()
 
-    def check(self, prior: Prior) -> None:
-        """`UserError` that names a setting which is out of range; timesteps are those of `prior`."""
-        first, last, known = self.first_timestep, self.last_timestep, prior.num_timesteps
+    def __post_init__(self) -> None:
+        first, last, known = self.first_timestep, self.last_timestep, self.prior.num_timesteps
         positive("solver", learning_rate=self.learning_rate)
         at_least(0, "solver", patience=self.patience)
         at_least(1, "solver", rescoring=self.rescoring)
@@ -112,6 +118,26 @@ class DescentSettings:
             ("last_timestep", last, 0 <= last <= first, "from 0 to first_timestep"),
             ("first_timestep", first, first < known, f"below the prior's {known} timesteps"),
         )
+
+    @timed
+    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
+        """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
+        energy = PairEnergy(self.prior, pairs, seed)
+
+        def of_step(poses: Tensor, step: int) -> Tensor:
+            noise = energy.noise(step if self.fresh_noise else 0)[:, 0]
+            return energy(poses, self.timestep(step / self.steps), noise)
+
+        to_poses = TwistPoses(starts.clone(), self.radius_map)
+        trajectory, energies, valid = self.descend(of_step, to_poses, starts.new_zeros(*starts.shape[:2], 6))
+        ends = trajectory[:, :, -1]
+        if self.choose_by == "rescored":
+            noise = energy.noise(self.steps, self.rescoring)
+            energies = energy.mean(ends, self.rescoring_timesteps(), noise)
+            valid = valid & energies.isfinite()
+        energies = energies.masked_fill(~valid, torch.nan)
+        path = unwrapped(trajectory) if self.trajectory else None
+        return Solution(ends, energies, valid, choose(energies), Cost(energy.passes), trajectory=path)
 
     def timestep(self, done: float) -> int:
         """The timestep when a share `done` in [0, 1) of the way from the first to the last is behind."""
@@ -128,34 +154,6 @@ class DescentSettings:
         return descend(energy, pose_of, twist, self.steps, adam, Plateau(adam, self.factor, self.patience))
 
 
-class TwistDescent(Solver):
-    """iFusion's descent of the prior's energy from every start: twists by Adam, the timestep falling with the step."""
-
-    def __init__(self, prior: Prior, radius_map: RadiusMap, settings: DescentSettings, trajectory: bool) -> None:
-        settings.check(prior)
-        self.prior, self.radius_map, self.settings, self.trajectory = prior, radius_map, settings, trajectory
-
-    @timed
-    def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
-        settings, energy = self.settings, PairEnergy(self.prior, pairs, seed)
-
-        def of_step(poses: Tensor, step: int) -> Tensor:
-            noise = energy.noise(step if settings.fresh_noise else 0)[:, 0]
-            return energy(poses, settings.timestep(step / settings.steps), noise)
-
-        to_poses = TwistPoses(starts.clone(), self.radius_map)
-        trajectory, energies, valid = settings.descend(of_step, to_poses, starts.new_zeros(*starts.shape[:2], 6))
-        ends = trajectory[:, :, -1]
-        if settings.choose_by == "rescored":
-            noise = energy.noise(settings.steps, settings.rescoring)
-            energies = energy.mean(ends, settings.rescoring_timesteps(), noise)
-            valid = valid & energies.isfinite()
-        energies = energies.masked_fill(~valid, torch.nan)
-        path = unwrapped(trajectory) if self.trajectory else None
-        return Solution(ends, energies, valid, choose(energies), Cost(energy.passes), trajectory=path)
-
-
 @register("solver", "ifusion")
 class IFusion(TwistDescent):
     """iFusion: Adam on a twist for each start, down the prior's energy in both directions.
@@ -165,22 +163,8 @@ class IFusion(TwistDescent):
     `patience` + 1. Left out: the published code drops each condition in 5% of the steps.
     """
 
-    def __init__(
-        self,
-        prior: Prior,
-        steps: int = 100,
-        learning_rate: float = 0.1,
-        factor: float = 0.6,
-        patience: int = 10,
-        first_timestep: int = 999,
-        last_timestep: int = 0,
-        choose_by: ChooseBy = "accumulated",
-        rescoring: int = 16,
-        fresh_noise: bool = True,
-        trajectory: bool = False,
-    ) -> None:
-        at_least(1, "solver", steps=steps)
-        settings = DescentSettings(
-            steps, learning_rate, factor, patience, first_timestep, last_timestep, choose_by, rescoring, fresh_noise
-        )
-        super().__init__(prior, SineRadius(), settings, trajectory)
+    radius_map = SineRadius()
+
+    def __post_init__(self) -> None:
+        at_least(1, "solver", steps=self.steps)
+        super().__post_init__()

@@ -18,7 +18,7 @@ from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose, tim
 from lp_framework.solvers.langevin import before_second_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
-from lp_framework.solvers.twist import ChooseBy, DescentSettings, TanhRadius, TwistDescent
+from lp_framework.solvers.twist import ChooseBy, TanhRadius, TwistDescent
 
 LONGEST_STEP = 0.5  # radians and scene units; the prior is not to be left where it hardly depends on the pose
 
@@ -51,16 +51,14 @@ class TwoStage(Solver):
         at_least(0, "solver", refinement_steps=refinement_steps)
         self.model, self.prior = model, prior
         self.first = before_second_stage(model, alpha, gamma, iterations, trajectory)
-        settings = DescentSettings(
-            refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep, choose_by, rescoring
-        )
-        self.second = TwistDescent(prior, TanhRadius(), settings, trajectory)
+        schedule = (refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep)
+        self.second = TwistDescent(prior, *schedule, choose_by, rescoring, trajectory=trajectory)
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start is invalid when the model or the prior failed on its way."""
         first = self.first.solve(pairs, starts, seed)
-        if self.second.settings.steps == 0:
+        if self.second.steps == 0:
             return first
         return in_a_row(first, lambda ends: self.second.solve(pairs, ends, seed))
 
