@@ -325,13 +325,13 @@ def test_one_gamma_is_the_longitudes(gamma):
 
 @pytest.mark.parametrize("gamma", [-0.1, (0.1, 0.2), (0.1, 0.2, -0.3), math.nan, math.inf, (1, 2, 3, 4)])
 def test_bad_gammas_are_named(gamma):
-    with pytest.raises(UserError, match=r"solver\.gamma must be one number .* or three .* none negative; got"):
+    with pytest.raises(UserError, match=r"solver\.gamma must be one number .* or three .* none negative, got"):
         Langevin(Exact(), gamma=gamma)
 
 
 @pytest.mark.parametrize(("sigma", "alpha"), [(1, 0.0), (1, -0.1), (1, 2.0), (1, math.nan), (0.5, 0.5), (2.0, 8.0)])
 def test_an_alpha_that_does_not_converge_is_refused(sigma, alpha):
-    with pytest.raises(UserError, match=rf"solver\.alpha must lie between 0 and {2 * sigma**2:g}, twice"):
+    with pytest.raises(UserError, match=rf"solver\.alpha must be between 0 and {2 * sigma**2:g}, twice"):
         Langevin(Exact(sigma), alpha=alpha)
 
 

@@ -166,5 +166,5 @@ def test_bad_settings_are_named():
         TwoStage(ExactModel(), ExactPrior(), refinement_steps=-1)
     with pytest.raises(UserError, match=r"solver.first_timestep must be below the prior's 1000 timesteps, got 2000"):
         TwoStage(ExactModel(), ExactPrior(), first_timestep=2000)
-    with pytest.raises(UserError, match=r"solver.alpha must lie between 0 and 2"):
+    with pytest.raises(UserError, match=r"solver.alpha must be between 0 and 2"):
         TwoStage(ExactModel(), ExactPrior(), alpha=3.0)

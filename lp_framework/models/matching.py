@@ -91,8 +91,6 @@ class MatchingModel(PoseModel):
         self.validation_loss = PairMean()
         self.register_buffer("pose_scale", torch.tensor(POSE_SCALE), persistent=False)
 
-    # ------------------------------------------------------------ use
-
     def encode(self, images: Tensor) -> ViewCells:
         """The cells of images `[I, 3, H, W]` in [-1, 1] and of their mirror images: each field `[I, 2, ...]`."""
         return self._encode(self.backbone.trunk(images))
@@ -152,8 +150,6 @@ class MatchingModel(PoseModel):
         result = torch.zeros_like(features)
         result[shown] = self.standardise(features[shown])
         return result
-
-    # ------------------------------------------------------------ training
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
         assert batch.cropped is not None  # of what the model carries

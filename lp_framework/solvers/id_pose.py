@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
 
@@ -27,6 +28,7 @@ _REFINEMENT = 0x4944  # separates the draws of the refinement from those of the 
 
 
 @register("solver", "id_pose")
+@dataclass(eq=False)
 class IDPose(Solver):
     """ID-Pose: probes a grid of candidates, then plain gradient descent on the spherical pose, one direction a step.
 
@@ -40,41 +42,36 @@ class IDPose(Solver):
     rates are for Zero123's energy: plain gradient descent diverges where rate times curvature passes 2.
     """
 
-    def __init__(
-        self,
-        prior: Prior,
-        candidates: Literal["grid", "starts"] = "grid",
-        longitudes: int = 8,
-        latitudes_degrees: Sequence[float] = (-120.0, -60.0, 0.0, 60.0, 120.0),
-        timestep: float = 0.2,
-        timestep_span: float = 0.01,
-        probes: int = 16,
-        exploration_steps: int = 10,
-        exploration_rate: float = 10.0,
-        kept: int = 5,
-        refinement_steps: int = 600,
-        refinement_rate: float = 1.0,
-        averaged: int = 20,
-        trajectory: bool = False,
-    ) -> None:
-        at_least(1, "solver", longitudes=longitudes, probes=probes, kept=kept, averaged=averaged)
-        at_least(0, "solver", exploration_steps=exploration_steps, refinement_steps=refinement_steps)
-        positive("solver", exploration_rate=exploration_rate, refinement_rate=refinement_rate)
+    prior: Prior
+    candidates: Literal["grid", "starts"] = "grid"
+    longitudes: int = 8
+    latitudes_degrees: Sequence[float] = (-120.0, -60.0, 0.0, 60.0, 120.0)
+    timestep: float = 0.2
+    timestep_span: float = 0.01
+    probes: int = 16
+    exploration_steps: int = 10
+    exploration_rate: float = 10.0
+    kept: int = 5
+    refinement_steps: int = 600
+    refinement_rate: float = 1.0
+    averaged: int = 20
+    trajectory: bool = False
+
+    def __post_init__(self) -> None:
+        at_least(1, "solver", longitudes=self.longitudes, probes=self.probes, kept=self.kept, averaged=self.averaged)
+        at_least(0, "solver", exploration_steps=self.exploration_steps, refinement_steps=self.refinement_steps)
+        positive("solver", exploration_rate=self.exploration_rate, refinement_rate=self.refinement_rate)
+        latitudes, timestep, span = self.latitudes_degrees, self.timestep, self.timestep_span
         check_settings(
             "solver",
-            ("latitudes_degrees", latitudes_degrees, len(latitudes_degrees) >= 1, "one angle or more"),
+            ("latitudes_degrees", latitudes, len(latitudes) >= 1, "one angle or more"),
             ("timestep", timestep, 0 <= timestep < 1, "in [0, 1)"),
-            ("timestep_span", timestep_span, 0 <= timestep_span <= 1 - timestep, "from 0 to 1 - timestep"),
+            ("timestep_span", span, 0 <= span <= 1 - timestep, "from 0 to 1 - timestep"),
         )
-        self.prior, self.candidates = prior, candidates
-        around = [2 * math.pi * number / longitudes for number in range(longitudes)]
-        self.grid = [(math.radians(each), longitude, 0.0) for longitude in around for each in latitudes_degrees]
-        self.timestep = int(timestep * prior.num_timesteps)
-        shares = [timestep + timestep_span * number / probes for number in range(probes)]
-        self.probe_timesteps = [int(share * prior.num_timesteps) for share in shares]
-        self.exploration_steps, self.exploration_rate, self.kept = exploration_steps, exploration_rate, kept
-        self.refinement_steps, self.refinement_rate, self.averaged = refinement_steps, refinement_rate, averaged
-        self.trajectory = trajectory
+        around = [2 * math.pi * number / self.longitudes for number in range(self.longitudes)]
+        self.grid = [(math.radians(each), longitude, 0.0) for longitude in around for each in latitudes]
+        shares = [timestep + span * number / self.probes for number in range(self.probes)]
+        self.probe_timesteps = [int(share * self.prior.num_timesteps) for share in shares]
 
     def samples_per_pair(self, starts: int) -> int:
         """See `Solver`; between the many candidates of the exploration and the one of the refinement."""
@@ -194,13 +191,13 @@ class IDPose(Solver):
 
     def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
         """Denoising errors `[B, N]` of images `target` from `source`, `[B]`, under poses `[B, N, 3]`, a noise a row."""
-        count = poses.shape[1]
+        count, timestep = poses.shape[1], int(self.timestep * self.prior.num_timesteps)
         energy.passes += poses.shape[0] * count
         errors = self.prior.denoising_error(
             energy.codes[target.repeat_interleave(count)],
             energy.codes[source.repeat_interleave(count)],
             poses.flatten(0, 1),
-            torch.full((len(target) * count,), self.timestep, device=poses.device),
+            torch.full((len(target) * count,), timestep, device=poses.device),
             noise.repeat_interleave(count, dim=0),
         )
         return errors.view(-1, count)

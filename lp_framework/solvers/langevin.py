@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lp_framework.errors import UserError, at_least
+from lp_framework.errors import UserError, at_least, check_settings
 from lp_framework.geometry import reduce_longitude, wrap_angle
 from lp_framework.keyed_random import keyed_normal
 from lp_framework.models.pose_model import PoseModel
@@ -56,10 +56,8 @@ class Langevin(Solver):
         trajectory: bool = False,
     ) -> None:
         limit = 2 * model.sigma**2  # a step leaves 1 - alpha / sigma^2 of the way to the truth
-        if not 0 < alpha < limit:
-            raise UserError(
-                f"solver.alpha must lie between 0 and {limit:g}, twice the model's sigma^2, to converge; got {alpha}"
-            )
+        converging = f"between 0 and {limit:g}, twice the model's sigma^2, to converge"
+        check_settings("solver", ("alpha", alpha, 0 < alpha < limit, converging))
         at_least(0, "solver", iterations=iterations)
         if choose_by == "energy" and not model.has_energy:
             raise UserError("solver.choose_by=energy needs model=energy; a score model has no energy, use distance")
@@ -152,10 +150,8 @@ def before_second_stage(
 def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:
     """`sigma` of every step."""
     ends = [sigma] * 2 if isinstance(sigma, int | float) else [*sigma]
-    if len(ends) != 2 or not all(0 < each < math.inf for each in ends):
-        raise UserError(
-            f"solver.sigma must be one positive number, or two (the first and the last step's); got {sigma}"
-        )
+    fits = len(ends) == 2 and all(0 < each < math.inf for each in ends)
+    check_settings("solver", ("sigma", sigma, fits, "one positive number, or two (the first and the last step's)"))
     first, last = ends
     return [first * (last / first) ** (step / max(1, steps - 1)) for step in range(steps)]
 
@@ -163,9 +159,7 @@ def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:
 def _triple(gamma: float | Sequence[float]) -> list[float]:
     """`gamma` of latitude, longitude and radius, from three numbers or from one that is the longitude's."""
     triple = [0.0, float(gamma), 0.0] if isinstance(gamma, int | float) else [float(each) for each in gamma]
-    if len(triple) != 3 or not all(0 <= each < math.inf for each in triple):
-        raise UserError(
-            "solver.gamma must be one number (longitude) or three (latitude, longitude, radius), "
-            f"none negative; got {gamma}"
-        )
+    fits = len(triple) == 3 and all(0 <= each < math.inf for each in triple)
+    wanted = "one number (longitude) or three (latitude, longitude, radius), none negative"
+    check_settings("solver", ("gamma", gamma, fits, wanted))
     return triple

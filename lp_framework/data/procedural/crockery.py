@@ -6,21 +6,12 @@ import numpy as np
 from numpy.random import Generator
 from PIL import Image
 
+from lp_framework.data.procedural import textures as tx
 from lp_framework.data.procedural.labels import brand, panel
 from lp_framework.data.procedural.paint import pen, plain
 from lp_framework.data.procedural.shapes import Parts, around, body, handle, pair, stick, vessel
 from lp_framework.data.procedural.solids import Array, arc, box, curve, cylinder, ellipsoid, extrude, lathe, rod, tube
-from lp_framework.data.procedural.textures import (
-    chance,
-    colour,
-    colour_at,
-    frieze,
-    ground,
-    ink,
-    material,
-    pick,
-    picture,
-)
+from lp_framework.data.procedural.textures import chance, colour, colour_at, ground, ink, material, pick
 
 GLAZES = ("white", "white", "white", "pale", "vivid", "deep", "brown", "grey", "black")
 
@@ -34,7 +25,7 @@ def glaze(random: Generator) -> Image.Image:
             pen(image).rectangle([0, top, 512, top + random.uniform(6, 60)], fill=colour(random))
     elif kind < 0.65:
         high = int(random.integers(60, 320))
-        strip = frieze(random, 512, high, pick(random, (8, 16, 32)), base)
+        strip = tx.frieze(random, 512, high, pick(random, (8, 16, 32)), base)
         image.paste(strip, (0, int(random.integers(0, 512 - high))))
     return image
 
@@ -46,7 +37,7 @@ def scene_around(random: Generator) -> Image.Image:
         base = colour_at(image)
         for u in np.arange(5) / 5:
             tile = Image.new("RGB", (160, 160), base)
-            picture(random, tile, 80, 80, 76, base)
+            tx.picture(random, tile, 80, 80, 76, base)
             low = random.uniform(0.3, 0.55)
             stick(tile, u, low, low + 0.35, random.uniform(0.14, 0.19), image)
     else:

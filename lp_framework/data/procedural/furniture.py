@@ -39,9 +39,8 @@ def cabinet(random: Generator) -> Parts:
     for k in closed:
         middle = y * ((k + 0.5) / storeys - 0.5)
         parts.append((board(0.94 * x, 0.9 * y / storeys, w).move(0, middle, z / 2), doors))
-        parts.append(
-            (cylinder(0.025, 0.06, 0.005, 16).turn("x", 90).move(side, middle, z / 2 + w), plain((60, 60, 62)))
-        )
+        knob = cylinder(0.025, 0.06, 0.005, 16).turn("x", 90)
+        parts.append((knob.move(side, middle, z / 2 + w), plain((60, 60, 62))))
     return parts
 
 

@@ -57,9 +57,6 @@ def chance(random: Generator, probability: float) -> bool:
     return bool(random.random() < probability)
 
 
-# ---------------------------------------------------------------- colours
-
-
 def colour(random: Generator, *tones: str) -> Colour:
     """A random colour of one of these `TONES`, by default of any."""
     names = tones or tuple(TONES)
@@ -89,9 +86,6 @@ def ink(random: Generator, ground: Colour, *tones: str) -> Colour:
         if contrast(found := colour(random, *tones), ground) > 80:
             return found
     return max(((24, 22, 26), (250, 248, 240)), key=lambda extreme: contrast(extreme, ground))
-
-
-# ---------------------------------------------------------------- patterns and materials
 
 
 def pattern(random: Generator, image: Image.Image, paint: Colour) -> None:
@@ -148,9 +142,6 @@ def material(random: Generator, *tones: str, grained: float = 0.0) -> Image.Imag
     image, speckles = Image.new("RGB", (96, 96), base), random.random((96, 96)) < random.uniform(0.02, 0.2)
     image.paste(ink(random, base), mask=Image.fromarray(speckles.astype(np.uint8) * 255))
     return image
-
-
-# ---------------------------------------------------------------- pictures
 
 
 def draw_picture(image: Image.Image, name: str, x: float, y: float, radius: float, colours: Sequence[Colour]) -> None:

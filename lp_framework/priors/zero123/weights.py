@@ -21,13 +21,9 @@ from lp_framework.priors.zero123.tensor_files import StoredTensor, read_safetens
 PARTS, PROJECTIONS = ("unet", "vae", "image_encoder"), ("cc_projection", "clip_camera_projection")
 WEIGHT_FILES = [  # of diffusers and of transformers, best first
     f"{stem}{variant}.{suffix}"
-    for suffix, transformers in (
-        ("safetensors", "model"),
-        ("safetensors.index.json", "model"),
-        ("bin", "pytorch_model"),
-    )
+    for suffix in ("safetensors", "safetensors.index.json", "bin")
     for variant in ("", ".fp16")
-    for stem in ("diffusion_pytorch_model", transformers)
+    for stem in ("diffusion_pytorch_model", "pytorch_model" if suffix == "bin" else "model")
 ]
 OLD_VAE_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}  # before diffusers 0.18
 LEFT_OVER = ("vision_model.embeddings.position_ids",)  # before transformers 4.31
