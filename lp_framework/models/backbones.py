@@ -74,15 +74,11 @@ class Standardise(nn.Module):
     Unlike batch normalisation it never uses the batch's own statistics: a batch here has many views of few objects.
     """
 
-    count: Tensor
-    mean: Tensor
-    variance: Tensor
-
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.register_buffer("count", torch.zeros(()))
-        self.register_buffer("mean", torch.zeros(dim))
-        self.register_buffer("variance", torch.zeros(dim))
+        self.count = nn.Buffer(torch.zeros(()))
+        self.mean = nn.Buffer(torch.zeros(dim))
+        self.variance = nn.Buffer(torch.zeros(dim))
 
     def forward(self, features: Tensor) -> Tensor:
         """`[I, dim]` to `[I, dim]`; in training the statistics take the batch in first."""
@@ -210,8 +206,6 @@ class ResNet(Backbone):
     """
 
     trunk_name = "resnet"
-    mean: Tensor
-    std: Tensor
 
     def __init__(
         self,
@@ -238,8 +232,8 @@ class ResNet(Backbone):
                 )
         self.resnet.fc = nn.Identity()
         self.head = nn.Identity()
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
+        self.mean = nn.Buffer(torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.std = nn.Buffer(torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         if frozen:
             self.resnet.eval().requires_grad_(False)
 

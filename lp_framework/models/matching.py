@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lp_framework.data.pairs import PairBatch
 from lp_framework.data.photographic import CELLS
@@ -48,7 +48,6 @@ class MatchingModel(PoseModel):
 
     backbone: EfficientNetLite0Maps
     has_energy, has_density, choose_by, carries_points = True, True, "energy", True
-    pose_scale: Tensor
 
     def __init__(
         self,
@@ -89,7 +88,7 @@ class MatchingModel(PoseModel):
         self.encoder = ViewEncoder(backbone.feature_dim, width, layers, heads, descriptor, polls, dropout)
         self.voting = Voting(width, polls)
         self.validation_loss = PairMean()
-        self.register_buffer("pose_scale", torch.tensor(POSE_SCALE), persistent=False)
+        self.pose_scale = nn.Buffer(torch.tensor(POSE_SCALE), persistent=False)
 
     def encode(self, images: Tensor) -> ViewCells:
         """The cells of images `[I, 3, H, W]` in [-1, 1] and of their mirror images: each field `[I, 2, ...]`."""

@@ -132,8 +132,6 @@ class ViewEncoder(nn.Module):
 class Voting(nn.Module):
     """From two views' cells to the log-density of the relative longitude, and the relative latitude and radius."""
 
-    angles: Tensor
-
     def __init__(self, width: int, polls: int) -> None:
         super().__init__()
         self.temperature, self.no_match = nn.Parameter(torch.tensor(2.3)), nn.Parameter(torch.tensor(3.0))
@@ -144,9 +142,8 @@ class Voting(nn.Module):
         self.vote_scale = nn.Parameter(torch.tensor(0.1))
         self.from_moments = nn.Sequential(nn.Linear(MOMENTS**2 + 1, 64), nn.ReLU(), nn.Linear(64, 4))
         self.from_views = nn.Sequential(nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, 2))
-        self.register_buffer(
-            "angles", torch.arange(HARMONICS + 1)[:, None] * torch.arange(BINS) * (2 * math.pi / BINS), persistent=False
-        )
+        angles = torch.arange(HARMONICS + 1)[:, None] * torch.arange(BINS) * (2 * math.pi / BINS)
+        self.angles = nn.Buffer(angles, persistent=False)
 
     def matches(self, reference: ViewCells, query: ViewCells) -> tuple[Tensor, Tensor]:
         """Log-probabilities that cells match: of each cell of the reference over the query's and none `[P, K, K + 1]`,

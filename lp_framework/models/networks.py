@@ -12,13 +12,11 @@ class PoseEmbedding(nn.Module):
     With `periodic` longitudes 0 and 2 pi are embedded alike; the paper's target on the line tells them apart.
     """
 
-    frequencies: Tensor
-
     def __init__(self, frequencies: int = 4, periodic: bool = True) -> None:
         super().__init__()
         doubling = 2.0 ** torch.arange(frequencies)
         longitude = doubling if periodic else doubling / 4
-        self.register_buffer("frequencies", torch.stack([doubling, longitude, doubling]), persistent=False)
+        self.frequencies = nn.Buffer(torch.stack([doubling, longitude, doubling]), persistent=False)
         self.dim = 6 * frequencies
 
     def forward(self, pose: Tensor) -> Tensor:

@@ -34,17 +34,13 @@ class PrincipalLatents(nn.Module):
     A linear map, so that noise of the latents is noise of the image; `spread` `[dim]` are the standard deviations.
     """
 
-    mean: Tensor
-    basis: Tensor
-    spread: Tensor
-
     def __init__(self, dim: int, scale: float) -> None:
         super().__init__()
         self.dim, self.scale = dim, scale
         pixels = 3 * LATENT_PIXELS**2
-        self.register_buffer("mean", torch.zeros(pixels))
-        self.register_buffer("basis", torch.zeros(pixels, dim))  # scaled
-        self.register_buffer("spread", torch.zeros(dim))
+        self.mean = nn.Buffer(torch.zeros(pixels))
+        self.basis = nn.Buffer(torch.zeros(pixels, dim))  # scaled
+        self.spread = nn.Buffer(torch.zeros(dim))
 
     @torch.no_grad()
     def fit(self, pixels: Tensor) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from lp_framework.data.files import read_json
@@ -45,8 +45,6 @@ class TrunkAndPixels:
 class PriorModel(TrainedModule):
     """The tiny prior: a pose-conditioned diffusion model of small images, trained by denoising (Ho et al. 2020)."""
 
-    alphas_cumprod: Tensor
-
     def __init__(
         self,
         backbone: Backbone,
@@ -69,7 +67,7 @@ class PriorModel(TrainedModule):
         check_settings("model", ("latent_dim", latent_dim, 1 <= latent_dim <= 3072, "from 1 to 3072"))
         self.networks = TinyNetworks(backbone.feature_dim, latent_dim, scale, orders, width, layers)
         self.view_loss = view_loss
-        self.register_buffer("alphas_cumprod", scaled_linear_alphas(), persistent=False)
+        self.alphas_cumprod = nn.Buffer(scaled_linear_alphas(), persistent=False)
         self.validation_loss = PairMean()
 
     def extractor(self) -> FeatureExtractor | None:

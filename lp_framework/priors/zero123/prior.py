@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from lp_framework.errors import UserError
@@ -98,10 +98,6 @@ class Zero123Prior(Prior):
     spares the host a thousand launches a step. On a GPU that runs out of memory `max_batch` is halved.
     """
 
-    alphas_cumprod: Tensor
-    clip_mean: Tensor
-    clip_std: Tensor
-
     def __init__(
         self,
         networks: Networks,
@@ -128,9 +124,9 @@ class Zero123Prior(Prior):
         self.image_size, self.latent_shape = IMAGE_SIZE, (int(self.vae.config.latent_channels), side, side)
         self.channels_last, self.cuda_graph, self.replayed = channels_last, cuda_graph, Replayed()
         self.chunks, self.image_chunks = (Chunks(max_batch, self.replayed.forget) for _ in range(2))
-        self.register_buffer("alphas_cumprod", scaled_linear_alphas(), persistent=False)
-        self.register_buffer("clip_mean", torch.tensor(CLIP_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("clip_std", torch.tensor(CLIP_STD).view(3, 1, 1), persistent=False)
+        self.alphas_cumprod = nn.Buffer(scaled_linear_alphas(), persistent=False)
+        self.clip_mean = nn.Buffer(torch.tensor(CLIP_MEAN).view(3, 1, 1), persistent=False)
+        self.clip_std = nn.Buffer(torch.tensor(CLIP_STD).view(3, 1, 1), persistent=False)
         self.num_timesteps = len(self.alphas_cumprod)
 
     def _apply(self, function: Any, recurse: bool = True) -> Any:
