@@ -97,9 +97,8 @@ class Standardise(nn.Module):
         count = self.count + added.squeeze()
         offset = total / added - self.mean  # of the new mean from the old one
         share = added / count
-        self.variance += share * (squares / added - self.variance) - (share * offset).square()
-        self.variance.clamp_(min=0)
-        self.mean += share * offset
+        self.variance.add_(share * (squares / added - self.variance) - (share * offset).square()).clamp_(min=0)
+        self.mean.add_(share * offset)
         self.count.copy_(count)
 
 

@@ -176,9 +176,8 @@ def describe(checkpoint: Path) -> str:
     """A checkpoint in words, for the terminal."""
     if checkpoint.is_relative_to(SHIPPED):
         name = checkpoint.parent.name
-        return (
-            f"{name}, which ships with lp_framework (trained on {TRAINED_ON.get(name, 'the twelve embedded objects')})"
-        )
+        objects = TRAINED_ON.get(name, "the twelve embedded objects")
+        return f"{name}, which ships with lp_framework (trained on {objects})"
     return str(checkpoint)
 
 

@@ -60,7 +60,7 @@ def bottle(random: Generator, flat: bool, told: bool = True) -> Parts:
         around([panel(random, b, role, width, 1) for role, width in roles], low, high, sheet)
     elif told or chance(random, 0.5):
         front, back = (panel(random, b, role, 0.9 * wide, high - low) for role in ("front", "back"))
-        stick(front, 0.5, low, high, 0.34, sheet, oval_shaped=chance(random, 0.3))
+        stick(front, 0.5, low, high, 0.34, sheet, elliptic=chance(random, 0.3))
         if flat and chance(random, 0.5):
             stick(back, 0.0, low, high, 0.34, sheet)
     cap = cylinder(neck * random.uniform(0.5, 0.7), random.uniform(0.06, 0.16), 0.01, 24)
@@ -119,7 +119,7 @@ def jug(random: Generator) -> Parts:
     base, paint = colour(random), plain(colour(random))
     sheet = Image.new("RGB", (512, 512), base)
     for u, role in ((0.5, "front"), (0.0, pick(random, ("back", "facts", "front")))):
-        stick(panel(random, b, role, 0.8 * wide, 0.5 * y), u, 0.08, 0.62, 0.3, sheet, oval_shaped=chance(random, 0.3))
+        stick(panel(random, b, role, 0.8 * wide, 0.5 * y), u, 0.08, 0.62, 0.3, sheet, elliptic=chance(random, 0.3))
     if chance(random, 0.55):
         grip = handle(0.3 * wide, 0.4 * y, 0.9 * y, random.uniform(0.3, 0.45) * wide, 0.045, 0.8)
         cap = cylinder(0.14 * wide + 0.02, 0.1, 0.015, 24).move(y=y + 0.1)

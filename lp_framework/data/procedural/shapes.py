@@ -108,19 +108,13 @@ def box_sheet(faces: Sequence[Image.Image], size: int = 512) -> Image.Image:
 
 
 def stick(
-    picture: Image.Image,
-    u: float,
-    start: float,
-    stop: float,
-    width: float,
-    sheet: Image.Image,
-    oval_shaped: bool = False,
+    picture: Image.Image, u: float, start: float, stop: float, width: float, sheet: Image.Image, elliptic: bool = False
 ) -> None:
     """Stick a label on a `body`'s texture: its middle at `u`, `width` of the way around, between two heights."""
     left, right = round((u - width / 2) * sheet.width), round((u + width / 2) * sheet.width)
     top, bottom = round(sheet.height * (1 - stop)), round(sheet.height * (1 - start))
     label = picture.resize((max(1, right - left), max(1, bottom - top)), Image.Resampling.BILINEAR)
-    mask = Image.new("L", label.size, 0 if oval_shaped else 255)
+    mask = Image.new("L", label.size, 0 if elliptic else 255)
     ImageDraw.Draw(mask).ellipse([0, 0, label.width, label.height], fill=255)
     for shift in (-sheet.width, 0, sheet.width):  # what crosses the seam goes on at the other edge
         sheet.paste(label, (left + shift, top), mask)

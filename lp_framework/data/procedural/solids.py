@@ -174,7 +174,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 16, closed: bool = 
 
 def rod(start: ArrayLike, stop: ArrayLike, radius: float, segments: int = 12) -> Shape:
     """A straight round bar between two points."""
-    return tube([start, stop], radius, segments)
+    return tube(np.array([start, stop], dtype=np.float64), radius, segments)
 
 
 def torus(major: float, minor: float, segments: int = 40) -> Shape:
