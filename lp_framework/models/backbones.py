@@ -26,7 +26,7 @@ class Backbone(nn.Module):
     trunk_dim: int
     feature_dim: int
     frozen: bool  # the trunk is fixed, so its features may be cached
-    trunk_name = "stem"  # of the attribute that is the trunk's network
+    trunk_name: str  # of the attribute that is the pretrained network
     head: nn.Module  # [I, trunk_dim] -> [I, feature_dim]
 
     def trunk_features(self, images: Tensor) -> Tensor:
@@ -48,7 +48,7 @@ class Backbone(nn.Module):
         return self.head(self.trunk(images))
 
     def trunk_module(self) -> nn.Module:
-        """The trunk's network."""
+        """The pretrained network."""
         network: nn.Module = getattr(self, self.trunk_name)
         return network
 
@@ -121,6 +121,8 @@ class EfficientNetLite0(Backbone):
     say how an object stands. A head of two layers is trained on them, with `dropout` of the cached features.
     """
 
+    trunk_name = "stem"
+
     def __init__(self, hidden: int = 512, features: int = 32, dropout: float = 0.2) -> None:
         super().__init__()
         self.image_size, self.feature_dim, self.frozen = 224, features, True
@@ -151,6 +153,7 @@ class EfficientNetLite0Maps(Backbone):
     cell's neighbourhood of four), and the share of each quarter that shows the object, which is what is not white.
     """
 
+    trunk_name = "stem"
     CHANNELS = (40, 112, 192)  # of the features at strides 8, 16, 32
 
     def __init__(self) -> None:

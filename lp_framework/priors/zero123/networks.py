@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import nullcontext
+from textwrap import shorten
 from types import ModuleType
 from typing import Any, Literal
 
@@ -151,21 +152,17 @@ def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> N
 
 
 def _load(origin: str, network: nn.Module, weights: Mapping[str, StoredTensor], dtype: torch.dtype) -> None:
-    expected = network.state_dict()
-    missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
-    if missing or unknown:
-        kinds = (("missing", missing), ("unknown", unknown))
-        reasons = " and ".join(f"{len(names)} {kind} (such as '{names[0]}')" for kind, names in kinds if names)
-        raise UserError(f"{origin}: its tensors are not those of Zero123: {reasons}")
+    dimensions = {name: tensor.ndim for name, tensor in network.state_dict().items()}
     tensors = {}
     for name, stored in weights.items():
         tensor = stored.map()
-        if tensor.ndim == 4 and expected[name].ndim == 2:  # a 1x1 convolution of the autoencoder's attention
+        if tensor.ndim == 4 and dimensions.get(name) == 2:  # a 1x1 convolution of the autoencoder's attention
             tensor = tensor.flatten(1)
-        if tensor.shape != expected[name].shape:
-            shapes = f"{list(tensor.shape)} instead of {list(expected[name].shape)}"
-            raise UserError(f"{origin}: '{name}' has the shape {shapes}")
         # What is stored in the wanted type stays mapped, and processes share it; else the file's bytes are let go of.
         as_wanted = tensor.dtype == dtype and tensor.is_contiguous()
         tensors[name] = tensor if as_wanted else torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
-    network.load_state_dict(tensors, assign=True)
+    try:
+        network.load_state_dict(tensors, assign=True)
+    except RuntimeError as error:
+        reasons = shorten(" ".join(str(error).splitlines()[1:]), 200, placeholder=" ...")
+        raise UserError(f"{origin}: its tensors are not those of Zero123: {reasons}") from error
