@@ -101,8 +101,7 @@ class PoseDensity:
 
 
 def from_bins(logits: Tensor) -> Tensor:
-    """Log-densities on the grid `[..., GRID]` of a Fourier series given at fewer longitudes `[..., bins]`, an even
-    number that divides `GRID`."""
+    """Log-densities on the grid `[..., GRID]` of a Fourier series given at an even divisor of it, `[..., bins]`."""
     bins = logits.shape[-1]
     harmonics = torch.fft.rfft(logits.float())
     harmonics = torch.cat([harmonics[..., :-1], harmonics[..., -1:] / 2], dim=-1)  # half of it is of order -bins / 2

@@ -45,8 +45,7 @@ def _table(values: Tensor, sets: int, views: int) -> Tensor:
 
 
 def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:
-    """Longitudes `[S, H, V]` (numbers of the grid) along trees of pairs that are drawn, sure pairs sooner, each pair's
-    longitude by its density."""
+    """Longitudes `[S, H, V]` (numbers of the grid) along random trees of pairs, sure pairs sooner, by their density."""
     sets, views = told.shape[:2]
     uniform = keyed_uniform(
         seed, _TREES, ids[:, None, None], torch.arange(HYPOTHESES)[:, None], torch.arange(views - 1), count=2

@@ -1,8 +1,7 @@
 """Procedural objects without end: textured things as they stand about a house, each made from two numbers.
 
 Read from the bottom up: `paint` and `solids`, `textures` (colours, patterns, pictures), `labels` (prints of packages)
-and `shapes`, then the families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which picks the family
-and has the choice `data=procedural`.
+and `shapes`, then the families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which picks among them.
 """
 
 from __future__ import annotations

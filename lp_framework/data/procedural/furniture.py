@@ -115,8 +115,7 @@ def rack(random: Generator) -> Parts:
 
 
 def container(random: Generator, alike: bool) -> Parts:
-    """A box, tray or crate, open above or at both ends; one that is not `alike` after half a turn is a caddy with
-    compartments and a high end."""
+    """A box, tray or crate, open above or at both ends; unless `alike` after half a turn, a caddy with a high end."""
     x, z, y, w = random.uniform((0.6, 0.4, 0.12, 0.02), (1, 0.7, 0.6, 0.04))
     paint, planks = plain(colour(random)) if alike else timber(random), pick(random, (1, 1, 2, 3))
     walls = board(x, w, z)

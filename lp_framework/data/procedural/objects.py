@@ -9,8 +9,6 @@ from functools import partial
 import numpy as np
 import trimesh
 from numpy.random import Generator
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
 
 from lp_framework.data.meshes import Ambiguity, MeshObject
 from lp_framework.data.procedural import crockery, furniture, groceries, things
@@ -99,12 +97,7 @@ def procedural_scene(seed: int, index: int) -> trimesh.Scene:
     parts = family_of(seed, index).build(random)
     heading = pick(random, (0.0, random.uniform(0, 360)))
     light = random.uniform(0.7, 1.0) * random.uniform(0.9, 1.0, 3)  # brightness and tint
-    meshes = []
-    for shape, texture in parts:
-        turned = shape.turn("y", heading)
-        visual = TextureVisuals(shape.uv, PBRMaterial(baseColorTexture=texture, baseColorFactor=[*light, 1.0]))
-        meshes.append(trimesh.Trimesh(turned.vertices, turned.triangles, visual=visual, process=False))
-    return scene(*meshes)
+    return scene(*(shape.turn("y", heading).paint(texture, light) for shape, texture in parts))
 
 
 @register("data", "procedural")

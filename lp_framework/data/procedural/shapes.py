@@ -52,8 +52,7 @@ def oval(x: float, z: float, y: float, exponent: float = 2.0, count: int = 48) -
 
 
 def body(levels: ArrayLike, exponent: float = 2.0, count: int = 48, steps: int = 1) -> Shape:
-    """A closed body through ovals of the levels `[L, 3]` (x, z, y) from the bottom to the top, smooth where a level has
-    several `steps`; `v` is the height as a fraction."""
+    """A closed body through ovals at levels `[L, 3]` (x, z, y), smooth for `steps` > 1; `v` is the relative height."""
     rows = np.asarray(levels, float)
     rows = rows if steps == 1 else curve(rows, (len(rows) - 1) * steps + 1)
     shape = loft(np.stack([oval(max(x, 1e-3), max(z, 1e-3), y, exponent, count) for x, z, y in rows]))

@@ -52,10 +52,11 @@ class Shape:
             np.concatenate([self.triangles, other.triangles + len(self.vertices)]),
         )
 
-    def paint(self, texture: Image.Image | Colour) -> trimesh.Trimesh:
-        """The finished mesh, in a matt material of one colour or with a texture."""
+    def paint(self, texture: Image.Image | Colour, light: Array | None = None) -> trimesh.Trimesh:
+        """The finished mesh, in a matt material of one colour or with a texture, times a `light` of three colours."""
         texture = plain(texture) if isinstance(texture, tuple) else texture
-        material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0)
+        tint = None if light is None else [*light, 1.0]
+        material = PBRMaterial(baseColorTexture=texture, baseColorFactor=tint, metallicFactor=0.0, roughnessFactor=1.0)
         visual = TextureVisuals(uv=self.uv, material=material)
         return trimesh.Trimesh(self.vertices, self.triangles, visual=visual, process=False)
 
