@@ -23,6 +23,7 @@ from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, 
 from lp_framework.priors.tiny.networks import IMAGE_SIZE, Gaussian, TinyNetworks, predicted_noise, readout, shrink
 from lp_framework.registry import register
 
+Denoised = tuple[Tensor, Gaussian]
 DECODED = 16  # images a step that the decoder is trained on; it is the costliest part
 
 
@@ -92,7 +93,8 @@ class PriorModel(TrainedModule):
         generator = self._generator()
         timestep = torch.randint(len(self.alphas_cumprod), (len(batch),), generator=generator).to(self.device)
         noise = torch.randn(len(batch), latents.shape[1], generator=generator).to(self.device)
-        error, predicted = self._denoise(batch, code, latents, timestep, noise)
+        source, pose = code[batch.reference], batch.relative_poses()
+        residual, predicted = self.residual(source, pose, latents[batch.query], timestep, noise)
         view_loss = relative_pose_loss(readout(code, self.networks.orders), batch)
 
         # The decoder sees what it will have to decode: latents of views, and samples of what is predicted.
@@ -103,7 +105,7 @@ class PriorModel(TrainedModule):
         image = self.networks.decoder(torch.where(seen, latents[query], sampled))
         image_loss = functional.mse_loss(image.flatten(1), pixels[query])
 
-        loss = error.mean()
+        loss = residual.square().mean(dim=1).mean()
         for name, value in (("loss", loss), ("view_loss", view_loss), ("image_loss", image_loss)):
             self.log(f"train/{name}", value, prog_bar=name == "loss", batch_size=len(batch))
         return loss + self.view_loss * view_loss + image_loss
@@ -112,8 +114,9 @@ class PriorModel(TrainedModule):
         latents, ids = self.networks.latents(self._pixels(batch)), batch.ids
         timestep = keyed_bits(self.seed, ids, count=1).squeeze(-1).to(self.device) % len(self.alphas_cumprod)
         noise = keyed_normal(self.seed, ids, count=latents.shape[1]).to(latents)
-        error, _ = self._denoise(batch, self.networks.encoder(self._features(batch)), latents, timestep, noise)
-        self.validation_loss.update(ids, error)
+        source, pose = self.networks.encoder(self._features(batch))[batch.reference], batch.relative_poses()
+        residual, _ = self.residual(source, pose, latents[batch.query], timestep, noise)
+        self.validation_loss.update(ids, residual.square().mean(dim=1))
         self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
 
     def _features(self, batch: PairBatch) -> Tensor:
@@ -124,15 +127,12 @@ class PriorModel(TrainedModule):
     def _pixels(self, batch: PairBatch) -> Tensor:
         return shrink(batch.images) if batch.features is None else batch.features[:, self.backbone.trunk_dim :]
 
-    def _denoise(
-        self, batch: PairBatch, code: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor
-    ) -> tuple[Tensor, Gaussian]:
-        """Denoising errors `[P]` of the queries seen from their references, and what was predicted."""
+    def residual(self, code: Tensor, pose: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor) -> Denoised:
+        """Predicted minus true noise `[P, D]` in noised latents seen from the code's image, and the `Gaussian`."""
         alpha = self.alphas_cumprod[timestep][:, None]
-        noisy = alpha.sqrt() * latents[batch.query] + (1 - alpha).sqrt() * noise
-        predicted = self.networks.predict(code[batch.reference], batch.relative_poses())
-        error = (predicted_noise(noisy, alpha, predicted) - noise).square().mean(dim=1)
-        return error, predicted
+        noisy = alpha.sqrt() * latents + (1 - alpha).sqrt() * noise
+        predicted = self.networks.predict(code, pose)
+        return predicted_noise(noisy, alpha, predicted) - noise, predicted
 
 
 @register("prior", "tiny")
@@ -166,11 +166,9 @@ class TinyPrior(Prior):
 
     def residual(self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor) -> Tensor:
         self.check(target, source, pose, timestep, noise)
-        alpha = self.model.alphas_cumprod[timestep][:, None]
-        noise = noise.flatten(1)
-        noisy = alpha.sqrt() * target.latent.flatten(1) + (1 - alpha).sqrt() * noise
-        predicted = self.model.networks.predict(source.embedding[:, 0], pose)
-        return (predicted_noise(noisy, alpha, predicted) - noise)[..., None, None]
+        latent, code = target.latent.flatten(1), source.embedding[:, 0]
+        residual, _ = self.model.residual(code, pose, latent, timestep, noise.flatten(1))
+        return residual[..., None, None]
 
     @torch.no_grad()
     def generate(
