@@ -14,7 +14,8 @@ from torch.autograd import forward_ad
 from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from lp_framework.errors import UserError, one_line, optional_import
+from lp_framework.data.files import expecting
+from lp_framework.errors import UserError, optional_import
 from lp_framework.priors.zero123.tensor_files import StoredTensor
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -138,11 +139,8 @@ def choose_attention(unet: Any, kernel: Attention) -> None:
 
 def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> Networks:
     """The networks with these weights, whose `origin` a `UserError` for unfit sizes or tensors names."""
-    try:
-        with torch.device("meta"):
-            networks = Networks(configs)
-    except (TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
-        raise UserError(f"{origin}: its sizes are not those of Zero123's networks: {one_line(error)}") from error
+    with expecting(f"{origin}: its sizes are not those of Zero123's networks"), torch.device("meta"):
+        networks = Networks(configs)
     embeddings = networks.image_encoder.vision_model.embeddings  # its numbers of patches are in no file
     embeddings.position_ids = torch.arange(embeddings.position_embedding.num_embeddings)[None]
     for part, network in networks.named_children():

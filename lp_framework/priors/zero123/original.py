@@ -28,7 +28,7 @@ LEFT_OVER = re.compile(
     r"betas|(sqrt_|log_)?(one_minus_|recip_|recipm1_)?alphas_cumprod(_prev)?|posterior_\w+|logvar|scale_factor|"
     r"lvlb_weights|model_ema\..*|cond_stage_model\.(?!model\.visual\.).*|first_stage_model\.loss\..*"
 )
-# Each network has a table from the training code's modules to diffusers', which `renamed` applies; inverted, it leads
+# Each network has a table from the training code's modules to diffusers', which `_renamed` applies; inverted, it leads
 # back. Modules that have the same name in both are in no table.
 RESNET = {
     **{"in_layers.0": "norm1", "in_layers.2": "conv1", "emb_layers.1": "time_emb_proj"},
@@ -86,7 +86,10 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
 
 
 def _renamed(tensors: Tensors, modules: Mapping[str, str]) -> dict[str, StoredTensor]:
-    return {renamed(key, modules): stored for key, stored in tensors.items()}
+    """The tensors by their names with the module, the longest that is in the table, as the table has it."""
+    known = "|".join(re.escape(module) for module in sorted(modules, key=len, reverse=True))
+    module = re.compile(rf"^({known})(?=\.|$)")
+    return {module.sub(lambda found: modules[found[1]], key): stored for key, stored in tensors.items()}
 
 
 def _numbers(tensors: Tensors, pattern: str) -> list[int]:
@@ -190,13 +193,3 @@ def clip_modules(config: Mapping[str, Any]) -> dict[str, str]:
         original, ours = f"transformer.resblocks.{layer}", f"vision_model.encoder.layers.{layer}"
         names |= {f"{original}.{inner}": f"{ours}.{its}" for inner, its in CLIP_LAYER.items()}
     return names
-
-
-def renamed(key: str, modules: Mapping[str, str]) -> str:
-    """A tensor's name with its module, the longest that is in the table, as the table has it; others stay."""
-    parts = key.split(".")
-    for end in range(len(parts), 0, -1):
-        module = ".".join(parts[:end])
-        if module in modules:
-            return ".".join([modules[module], *parts[end:]])
-    return key
