@@ -193,18 +193,16 @@ def load_model(path: str | Path) -> PoseModel:
 def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
     """The trained module that a checkpoint (see `read_checkpoint`) holds; `file` names it in errors."""
     try:
-        recipe = checkpoint[RECIPE]
-        settings = dict(recipe["backbone"])
-        if settings.get("pretrained") and not settings.get("frozen"):
-            settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
-        backbone = registry.build("backbone", settings)
-        model: TrainedModule = registry.build("model", recipe["model"], backbone=backbone)
-        model.on_load_checkpoint(checkpoint)
+        with expecting("describes no model that can be built"):  # constructors fail in any way at odd values
+            recipe = checkpoint[RECIPE]
+            settings = dict(recipe["backbone"])
+            if settings.get("pretrained") and not settings.get("frozen"):
+                settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
+            backbone = registry.build("backbone", settings)
+            model: TrainedModule = registry.build("model", recipe["model"], backbone=backbone)
+            model.on_load_checkpoint(checkpoint)
     except UserError as error:
         raise UserError(f"{file}: {error}") from error
-    except Exception as error:  # constructors fail in any way at values that a file may hold
-        reason = f"{type(error).__name__}: {one_line(error)}"
-        raise UserError(f"{file}: describes no model that can be built ({reason})") from error
     try:
         model.load_state_dict(checkpoint["state_dict"])
     except Exception as error:  # of tensors that do not fit, or of what are no tensors

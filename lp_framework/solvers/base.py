@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 from lightning.fabric.utilities import move_data_to_device
@@ -16,6 +16,8 @@ from lp_framework.clock import now
 from lp_framework.data.pairs import PairBatch
 from lp_framework.errors import UserError
 from lp_framework.keyed_random import keyed_bits
+
+_Solve = TypeVar("_Solve", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ def check_starts(problems: Pairs | ViewSets, starts: Tensor) -> None:
         raise UserError("starts must be finite numbers")
 
 
-def timed(solve: Callable[..., Any]) -> Callable[..., Any]:
+def timed(solve: _Solve) -> _Solve:
     """Decorator of `solve` and `solve_views`: checks the starts, allows for derivatives, fills in the seconds."""
 
     @wraps(solve)
@@ -171,7 +173,7 @@ def timed(solve: Callable[..., Any]) -> Callable[..., Any]:
             solution = solve(self, problems, starts, seed)
         return replace(solution, cost=replace(solution.cost, seconds=now(starts.device) - began))
 
-    return whole
+    return cast(_Solve, whole)
 
 
 class NetworkUser:
