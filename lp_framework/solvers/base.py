@@ -163,14 +163,14 @@ def check_starts(problems: Pairs | ViewSets, starts: Tensor) -> None:
 
 
 def timed(solve: _Solve) -> _Solve:
-    """Decorator of `solve` and `solve_views`: checks the starts, allows for derivatives, fills in the seconds."""
+    """Decorator of `solve` and `solve_views`: checks the starts, needs no gradients, fills in the seconds."""
 
     @wraps(solve)
+    @torch.no_grad()
     def whole(self: Solver, problems: Pairs | ViewSets, starts: Tensor, seed: int) -> Any:
         check_starts(problems, starts)
         began = now(starts.device)
-        with torch.inference_mode(False), torch.no_grad():
-            solution = solve(self, problems, starts, seed)
+        solution = solve(self, problems, starts, seed)
         return replace(solution, cost=replace(solution.cost, seconds=now(starts.device) - began))
 
     return cast(_Solve, whole)

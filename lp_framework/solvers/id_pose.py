@@ -78,6 +78,8 @@ class IDPose(Solver):
         return 2 * self.kept
 
     @timed
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         energy = PairEnergy(self.prior, pairs, seed)
         explored, energies = self.explore(energy, starts)
@@ -95,6 +97,8 @@ class IDPose(Solver):
         return Solution(reduce_longitude(ends), energies, valid, chosen, Cost(energy.passes), trajectory=trajectory)
 
     @timed
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """See `Solver.solve_views`: chosen and refined together; the energies are those of the chosen candidates."""
         sets, views = view_sets.views.shape

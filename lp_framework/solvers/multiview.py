@@ -90,6 +90,8 @@ class MultiView(Solver):
         poses, energies, valid = (each[sets, chosen] for each in (joint.poses, joint.energies, joint.valid))
         return ViewSolution(poses, energies, valid, Cost(joint.passes))
 
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
         """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
         if self.first_stage and self.model.has_density:

@@ -120,6 +120,8 @@ class TwistDescent(Solver):
         )
 
     @timed
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
         energy = PairEnergy(self.prior, pairs, seed)

@@ -138,6 +138,8 @@ class GaussNewton(Solver):
         return in_a_row(first, lambda ends: self.refine(pairs, ends, seed))
 
     @timed
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def refine(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """The second stage alone, from starts `[B, N, 3]`."""
         energy = PairEnergy(self.prior, pairs, seed)
