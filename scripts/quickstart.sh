@@ -21,7 +21,7 @@ else
     rm -rf "$run"
     # While the training compiles PyTorch, which it imports first, another core compiles what it needs next.
     $python -c "import hydra.main, scipy.spatial, trimesh, plotly.offline, matplotlib.pyplot" &
-    $python -m lp_framework train "hydra.run.dir=$run" logger.tensorboard=false "$@"
+    $python -m lp_framework train "hydra.run.dir=$run" logger=csv "$@"
 fi
 echo
 echo "quickstart: evaluating both stages, the second one on the prior that ships, and the first one alone"

@@ -113,7 +113,7 @@ class Commands:
         if command == "train":
             settings |= {
                 "backbone": "tmp_tiny", "data.block": "3", "data.batch_pairs": "40",
-                "data.validation_views": "3", "trainer.max_epochs": "3", "logger.tensorboard": "false",
+                "data.validation_views": "3", "trainer.max_epochs": "3", "logger": "csv",
             }  # fmt: skip
             if "model=prior" not in overrides:
                 settings["model.hidden"] = "16"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning import Trainer
 from lightning.pytorch import callbacks
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -21,7 +22,7 @@ from rich.console import Console
 from lp_framework import catalogue, registry
 from lp_framework.commands import building
 from lp_framework.data.module import PairDataModule
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, optional_import
 from lp_framework.evaluation.tables import write_csv, write_json, write_text
 from lp_framework.models.checkpoints import BEST, FOLDER, LAST, ModelCheckpoint, read_checkpoint
 from lp_framework.models.pose_model import PoseModel
@@ -68,8 +69,7 @@ def run(config: DictConfig) -> None:
         data.cache_features(extractor)
     data.carries_points = model.carries_points
     loggers: list[Logger] = [MetricsLogger(folder, checkpoint.get("global_step", 0))]
-    if settings["logger"]["tensorboard"]:
-        loggers.append(TensorBoardLogger(folder, name="tensorboard", version=""))
+    loggers += chosen_logger(settings["logger"], folder)
     trainer = building.build_trainer(settings["trainer"], folder, chosen_callbacks(settings, folder), loggers)
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
@@ -104,6 +104,22 @@ def chosen_callbacks(settings: Mapping[str, Any], folder: Path) -> list[callback
             ModelCheckpoint(folder / FOLDER, **named, enable_version_counter=False, save_on_train_epoch_end=True)
         )
     return chosen
+
+
+def chosen_logger(settings: Mapping[str, Any], folder: Path) -> list[Logger]:
+    """Lightning's logger that is chosen besides `MetricsLogger`; `UserError` where its package is missing."""
+    install, name = "pip install 'lp_framework[loggers]'", settings.get("name")
+    if name == "tensorboard":
+        return [TensorBoardLogger(folder, name="tensorboard", version="")]
+    if name == "wandb":
+        optional_import("wandb", "logger=wandb", install)
+        given = {key: settings[key] for key in ("project", "entity", "offline")}
+        return [WandbLogger(folder.name, save_dir=folder, **given)]
+    if name == "mlflow":
+        optional_import("mlflow", "logger=mlflow", install)
+        address = settings["tracking_uri"] or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{folder}/mlflow.db"
+        return [MLFlowLogger(settings["experiment"], folder.name, tracking_uri=address)]
+    return []
 
 
 def next_command(settings: Mapping[str, Any], folder: str) -> str:
