@@ -50,7 +50,7 @@ def layout(objects: Sequence[str], first: str, views: int, checkpoints: Sequence
         forms.field("Descend from there by", dcc.Dropdown(solvers, SOLVERS, id="explore-solvers", multi=True)),
     ]
     shown = [
-        html.Div(id="explore-views", className="views small"),
+        html.Div([html.Div(id="explore-views"), html.Div(id="explore-view")], className="views small"),
         html.P(
             "Click anywhere on the map or on the surface, or move a slider, to go to a relative pose.", className="note"
         ),
@@ -119,23 +119,24 @@ def register(app: Dash, jobs: Jobs, bench: Workbench) -> None:
         Output("explore-views", "children"),
         Output("explore-landscape", "options"),
         Output("explore-landscape", "value"),
+        Output("explore-view", "children"),
         Output("explore-place", "children"),
         Output("explore-way", "data"),
         Output("explore-radius", "value"),
         Input(f"{TAB}-done", "data"),
-        State("explore-scene", "data"),
         prevent_initial_call=True,
     )
-    def show(job: str, scene: str) -> Any:
+    def show(job: str) -> Any:
         try:
             found = jobs.result(job)
         except UserError as error:
-            return str(error), *[no_update] * 8
+            return str(error), *[no_update] * 9
         if isinstance(found, Place):
-            return "", *[no_update] * 5, _place(jobs.result(scene), found), job, no_update
+            view = forms.image((255 * found.view).round().astype("uint8"), "what the prior generates from there")
+            return "", *[no_update] * 5, view, _place(found), job, no_update
         names, truth = list(found.pair.landscapes), found.pair.truth
         radius = 0.0 if truth is None else round(float(truth[2]), 2)  # at which the landscapes are
-        return "", job, False, _views(found), names, names[0], [], None, radius
+        return "", job, False, _views(found), names, names[0], [], [], None, radius
 
     @app.callback(
         Output("explore-map-figure", "data"),
@@ -195,8 +196,8 @@ def _views(scene: Scene) -> list[html.Figure]:
     return [forms.image(reference.image, "the reference"), forms.image(query.image, f"the query, in truth {place}")]
 
 
-def _place(scene: Scene, place: Place) -> list[Any]:
-    """The view, the energies and the ends of a place."""
+def _place(place: Place) -> list[Any]:
+    """The energies and the ends of a place."""
     latitude, longitude, radius = place.pose
     head = f"Latitude {math.degrees(latitude):.0f}°, longitude {math.degrees(longitude):.0f}°, radius {radius:.2f}"
     energies = [f"{name}: {value:.4g}" for name, value in place.energies.items()]
@@ -207,13 +208,14 @@ def _place(scene: Scene, place: Place) -> list[Any]:
     ]
     rows += [html.Tr([html.Th(words(name)), html.Td(why, colSpan=3)]) for name, why in place.refusals.items()]
     heads = ("a start from there, by", "ends", "from the truth", "its energy")
-    table = html.Table([html.Thead(html.Tr([html.Th(each, className="number") for each in heads])), html.Tbody(rows)])
-    views = [
-        forms.image(scene.pair.query.image, "the query"),
-        forms.image((255 * place.view).round().astype("uint8"), "what the prior generates from there"),
-    ]
-    told = html.Div([html.P("; ".join(energies)), html.Div(table, className="scrolls")])
-    return [html.H3(head.replace("-", "\N{MINUS SIGN}")), html.Div([*views, told], className="views")]
+    table = html.Table(
+        [
+            html.Thead(html.Tr([html.Th(heads[0]), *(html.Th(each, className="number") for each in heads[1:])])),
+            html.Tbody(rows),
+        ]
+    )
+    told = [html.P("; ".join(energies)), html.Div(table, className="scrolls")]
+    return [html.H3(head.replace("-", "\N{MINUS SIGN}")), *told]
 
 
 def _end(way: ShownPair) -> tuple[str, str, str]:
