@@ -57,7 +57,6 @@ default_role = (
     "code"  # docstrings write code as Markdown does, between single backticks
 )
 autodoc_member_order = "bysource"
-autodoc_preserve_defaults = True
 autodoc_type_aliases = {"ArrayLike": "ArrayLike", "NDArray": "NDArray"}
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 80

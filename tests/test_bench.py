@@ -166,7 +166,7 @@ def steps(monkeypatch):
         return round(torch.rad2deg(loop.poses(loop.twist)[1]).item())
 
     def solve(solver, pairs, starts, seed):
-        done.append(f"{solver.settings.steps} of {starts.shape[1]}")
+        done.append(f"{solver.steps} of {starts.shape[1]}")
 
     monkeypatch.setattr(IFusion, "solve", solve)
     monkeypatch.setattr(PlainLoop, "step", lambda self: done.append(f"at {longitude(self)}"))

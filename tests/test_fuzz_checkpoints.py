@@ -211,9 +211,8 @@ def test_a_run_that_is_resumed_does_not_run_what_its_checkpoint_brings(tmp_path)
         torch.save({**sound, place: Runs()}, last)
         shutil.copyfile(last, best)
         ran = commands.here("unused", "train", "resume=run", "trainer.max_epochs=2")
-        told = [line.partition(": ")[::2] for line in ran.err.splitlines()]  # a warning, since the best might do
-        assert ran.status == 1 and [kind for kind, _ in told] == ["WARNING", "error"]
-        assert all("is not a readable checkpoint (damaged, or holding more than numbers" in what for _, what in told)
+        assert ran.status == 1
+        assert "is not a readable checkpoint (damaged, or holding more than numbers" in ran.error
         assert not (commands.folder / "executed").exists()
 
 

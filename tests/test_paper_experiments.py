@@ -56,7 +56,7 @@ def test_an_experiment_is_the_papers_setting(lp, jobs, experiment, data, protoco
     for config in jobs:
         assert (config.data.name, config.data.path, config.protocol) == (data, "FOLDER", protocol)
         assert (config.prior.name, config.start.name, config.checkpoint) == ("zero123xl", "grid", "runs/model")
-        assert config.data.get("objects", "seen") == ("unseen" if experiment == "unseen" else "seen")
+        assert (config.data.get("objects") == "unseen") == (experiment == "unseen")
     # Every method of the paper's table is in it, under the settings that the table names.
     assert {row.settings["solver.name"] for row in paper_table(experiment).rows} == solvers
 
