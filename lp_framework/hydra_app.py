@@ -6,6 +6,7 @@ import argparse
 import importlib
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -150,8 +151,11 @@ def _check_paths(config: DictConfig) -> None:
                 raise UserError(f"{key}={path}: there is no such file or folder")
     checkpoint = str(config.get("checkpoint"))
     if checkpoint.startswith(("runs/", "./", "../", "/")) and not Path(checkpoint).exists():
-        how = f"to train it: lp train hydra.run.dir={checkpoint}"
-        raise UserError(f"checkpoint={checkpoint}: there is no such file or folder; {how}")
+        file = catalogue.find(f"experiment/{HydraConfig.get().runtime.choices.get('experiment')}")
+        text = f"train hydra.run.dir={checkpoint}" if file is None else file.read_text(encoding="utf-8")
+        train = re.search(rf"train [^`\n]*hydra\.run\.dir={re.escape(checkpoint)}(?!\w)", text)
+        hint = f"; to train it: lp {train[0]}" if train else ""
+        raise UserError(f"checkpoint={checkpoint}: there is no such file or folder{hint}")
     path = OmegaConf.select(config, "data.path")
     photographs = config.get("image") or config.get("images")  # instead of the data
     if not photographs and path is not None and not Path(path).exists():

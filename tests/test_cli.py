@@ -133,6 +133,10 @@ def test_an_experiment_that_is_a_sweep_needs_no_option_for_further_values(lp, mo
             ("eval", "checkpoint=runs/gone"),
             "checkpoint=runs/gone: there is no such file or folder; to train it: lp train hydra.run",
         ),
+        (
+            ("eval", "experiment=co3d", "hydra.mode=RUN", "checkpoint=runs/co3d", "data.path=."),
+            "checkpoint=runs/co3d: there is no such file or folder; to train it: lp train experiment=paper data=co3d",
+        ),
         (("estimate", "a.png", "b.png"), "images=a.png: there is no such file or folder"),
         (("report", "runs=20240101"), "runs=20240101: there is no such file or folder"),
     ],
