@@ -1,4 +1,4 @@
-"""Where views come from, views on disk, and batches of pairs; importing the package registers sources and renderers."""
+"""View sources, views on disk, and batches of pairs; importing the package registers sources and renderers."""
 
 from lp_framework.data import procedural, views
 from lp_framework.data.rendering import pyrender_renderer, raycast

@@ -1,4 +1,4 @@
-"""The data module: the views of a source, made first where need be, as batches of pairs."""
+"""The data module: batches of pairs of a source's views, which are created first if needed."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, ObjectViews, ViewSour
 from lp_framework.errors import UserError, check_settings
 from lp_framework.keyed_random import stable_id
 
-EVALUATION_PAIRS = 224  # pairs a batch, by default; four objects of eight test views
-LARGEST_SET = 8  # images that are evaluated together at most, as in the paper's multi-view table
+EVALUATION_PAIRS = 224  # default pairs per batch: four objects of eight test views
+LARGEST_SET = 8  # maximum number of images evaluated jointly, as in the paper's multi-view table
 
 
 class FeatureExtractor(Protocol):
-    """What the data module asks of a backbone in order to cache its features."""
+    """What the data module requires of a backbone to cache its features."""
 
     def trunk(self, images: Tensor) -> Tensor:
         """Features `[I, ...]` of images `[I, 3, H, W]` in [-1, 1]."""
 
     def to(self, device: torch.device) -> object:
-        """Move it there."""
+        """Move the backbone to a device."""
 
     def fingerprint(self) -> str:
-        """A text that changes when the trunk's output for some image would."""
+        """A string that changes whenever the trunk's output for any image would."""
 
 
 class PairDataModule(LightningDataModule):
     """Ordered pairs among the views of each object of a source.
 
-    `cache` holds the decoded views (square, `image_size` pixels a side). A training batch has about `batch_pairs` pairs
-    over blocks of `block` views (see `BlockSampler`). `validation_views` of each object's training views are held out
-    to choose the best checkpoint; or, with `validation_objects`, so many objects, of which so many views are used then.
-    The test views are not touched before evaluation; with `crop` they are prepared as photographs are, which loses the
-    radius.
+    `cache` is the folder of decoded views (square, `image_size` pixels a side). A training batch has about
+    `batch_pairs` pairs over blocks of `block` views (see `BlockSampler`). To choose the best checkpoint,
+    `validation_views` of each object's training views are held out; or, with `validation_objects`, that many objects,
+    of each of which that many views are used. Test views are used only for evaluation; with `crop` they are prepared
+    like photographs, which loses the radius.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ class PairDataModule(LightningDataModule):
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
         self.photographs, self.crop = photographs, crop
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
-        self.carries_points = False  # whether training batches have the points in space that depths tell
+        self.carries_points = False  # whether training batches have the 3-D points given by the depths
         self._extractor: FeatureExtractor | None = None
-        self._answer: list[str] = []  # of it
+        self._answer: list[str] = []  # digest of its output
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
-        self._views: int | None = None  # images a set, where sets are evaluated
+        self._views: int | None = None  # images per set, if sets are evaluated
         self._evaluation_pairs = EVALUATION_PAIRS
         self._left_out: set[tuple[int, int]] = set()
         self._folders: dict[str, list[ObjectViews]] = {}
@@ -92,12 +92,12 @@ class PairDataModule(LightningDataModule):
         self._image_keys: dict[str, str] = {}
 
     def prepare_data(self) -> None:
-        """Make what is missing on disk, in one process: views, decoded views, cached features."""
+        """Create what is missing on disk, in one process: views, decoded views, cached features."""
         self.source.prepare()
         self.data("train" if self._evaluation is None else self.evaluation_split())
 
     def table(self, split: str) -> ViewTable:
-        """All views of a split: "train" and "validation" divide the training views, "all_train" does not; "test"."""
+        """All views of a split: "test", "all_train", or "train" and "validation", which divide the training views."""
         if split not in self._tables:
             views = self._on_disk(split)
             if split in ("train", "validation") and self.validation_views:
@@ -106,14 +106,14 @@ class PairDataModule(LightningDataModule):
         return self._tables[split]
 
     def fingerprint(self, split: str) -> str:
-        """A text that changes with what a split's batches are made of: its images, names, cameras and labels."""
+        """A string that changes with the contents of a split's batches: images, names, cameras and labels."""
         table, folder = self.table(split), _folder(split)
         if folder not in self._image_keys:
             self.data(split)
         names = [file.name for file in table.files]
         labels = list(zip(table.names, table.counts, table.ambiguities, table.unique_answer, strict=True))
         angles = table.field_of_view
-        # Of views with the usual one the text stays what it was before others could be told apart.
+        # Omitted for the default field of view, so that existing fingerprints stay valid.
         others = [] if (angles == math.radians(FIELD_OF_VIEW_DEGREES)).all() else [angles.tolist()]
         return content_key([], "split", self._image_keys[folder], names, labels, table.cameras.tolist(), *others)
 
@@ -124,7 +124,7 @@ class PairDataModule(LightningDataModule):
         return self._folders[folder]
 
     def _divided(self, views: Sequence[ObjectViews], held_out: bool) -> list[ObjectViews]:
-        """Of training views what is held out for validation, or the rest."""
+        """The training views held out for validation, or the remaining ones."""
         if not self.validation_objects:
             return [self._some(each, held_out, left=2) for each in views]
         if self.validation_objects >= len(views):
@@ -136,7 +136,7 @@ class PairDataModule(LightningDataModule):
         return [self._some(each, held_out=True, left=0) for each in chosen] if held_out else chosen
 
     def _some(self, views: ObjectViews, held_out: bool, left: int) -> ObjectViews:
-        """The `validation_views` of an object, or its others, of which at least `left` are wanted."""
+        """The held-out `validation_views` of an object, or its remaining views; at least `left` must remain."""
         count = self.validation_views
         if len(views) < count + left:
             wanted = f"holding out data.validation_views={count} needs at least {count + left}"
@@ -149,11 +149,11 @@ class PairDataModule(LightningDataModule):
     def evaluate_on(
         self, protocol: str, seed: int = 0, batch_pairs: int = EVALUATION_PAIRS, views: int | None = None
     ) -> None:
-        """From now on prepare only what the pairs of an evaluation protocol need; `test_dataloader` gives them.
+        """Select the pairs of an evaluation protocol for `test_dataloader`, and prepare only their views from now on.
 
-        With `views` these are `ViewTable.view_sets` of so many test views instead. A set comes as the pairs of its
-        first view with each other one, `views` - 1 in a row; a batch holds whole sets, as many as make `batch_pairs`
-        pairs, one at least.
+        With `views`, select the sets `ViewTable.view_sets` of that many test views instead. A set is `views` - 1
+        consecutive pairs, its first view with each of the others. A batch holds whole sets: at least one, and as many
+        as make `batch_pairs` pairs.
         """
         if views is not None and (not isinstance(views, int) or not 2 <= views <= LARGEST_SET):
             raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
@@ -162,24 +162,24 @@ class PairDataModule(LightningDataModule):
         self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), views, batch_pairs
 
     def leave_out(self, pairs: Iterable[Sequence[int]]) -> None:
-        """From now on `test_dataloader` leaves out the batches all of whose pairs (rows of the table) are among these.
+        """Make `test_dataloader` skip batches whose pairs (rows of the table) are all among `pairs`.
 
-        The other batches stay as they are, so that what is computed of them stays the same to the last bit.
+        The other batches stay unchanged, so that their results are bit-identical.
         """
         self._left_out = {(reference, query) for reference, query in pairs}
 
     def evaluation_split(self) -> str:
-        """The split that the protocol of `evaluate_on` takes its pairs from."""
+        """The split used by the protocol of `evaluate_on`."""
         return "all_train" if self._evaluation is not None and self._evaluation[0] == "ifusion" else "test"
 
     def cache_features(self, extractor: FeatureExtractor) -> None:
-        """From now on batches carry the features of a frozen backbone, computed once, instead of images."""
+        """Make batches carry the features of a frozen backbone, computed once, instead of images."""
         self._extractor, self._answer = extractor, _answer(extractor, self.image_size)
 
     def data(self, split: str) -> PairData:
-        """The batches of a split, addressed by pairs."""
+        """The batches of a split, indexed by pairs."""
         table = self.table(split)
-        # Training and validation views share one array, so that another way to divide them decodes nothing anew.
+        # Training and validation views share one array, so that a different division needs no new decoding.
         files = [file for views in self._on_disk(split) for file in views.files]
         crop = self.crop and split in ("test", "all_train")
         if _folder(split) == "train" and (self.photographs or self.carries_points):
@@ -190,7 +190,7 @@ class PairDataModule(LightningDataModule):
             arrays = {"images": views}
         self._image_keys[_folder(split)] = key
         if (extractor := self._extractor) is not None:
-            # By the file of the decoded views, whose name tells how they were decoded.
+            # Keyed by the file of decoded views, whose name identifies how they were decoded.
             feature_key = content_key(
                 [], "features", Path(str(views.filename)).stem, extractor.fingerprint(), self._answer
             )
@@ -206,7 +206,7 @@ class PairDataModule(LightningDataModule):
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def train_dataloader(self) -> DataLoader[PairBatch]:
-        """All ordered pairs of the training views once an epoch."""
+        """All ordered pairs of the training views, once per epoch."""
         data = self.data("train")
         sampler = BlockSampler(data.table, self.batch_pairs, self.block, self.seed, *self._ranks())
         return DataLoader(data, batch_size=None, sampler=sampler)
@@ -219,7 +219,7 @@ class PairDataModule(LightningDataModule):
         return self._listed(data, in_batches(data.table.pairs("ordered"), self.batch_pairs))
 
     def test_dataloader(self) -> DataLoader[PairBatch]:
-        """The pairs or sets to evaluate on that were chosen, by default all ordered pairs of the test views."""
+        """The pairs or sets chosen for evaluation, by default all ordered pairs of the test views."""
         data = self.data(self.evaluation_split())
         if self._views is not None:
             sets, others = data.table.view_sets(self._views), self._views - 1
@@ -240,8 +240,8 @@ def _folder(split: str) -> str:
 
 
 def _answer(extractor: FeatureExtractor, size: int) -> list[str]:
-    """What an extractor makes of one image, which its code and its settings change, too; so coarse that another machine
-    comes to the same."""
+    """A coarse digest of the extractor's output for one image, which changes with its code and settings, not the
+    machine."""
     image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     with torch.inference_mode():
         features = extractor.trunk(image).float().flatten()
@@ -250,7 +250,7 @@ def _answer(extractor: FeatureExtractor, size: int) -> list[str]:
 
 def _extracted(extractor: FeatureExtractor, images: NDArray, device: torch.device) -> Iterator[NDArray]:
     count = 32 if device.type == "cpu" else 256
-    extractor.to(device)  # not in inference mode: what is moved there cannot be trained any more
+    extractor.to(device)  # not in inference mode: parameters moved there can no longer be trained
     for start in tracked(range(0, len(images), count), "computing features"):
         with torch.inference_mode():
             pixels = torch.tensor(images[start : start + count]).to(device)  # a copy: the cache is read-only

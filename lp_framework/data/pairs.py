@@ -1,4 +1,4 @@
-"""Pairs of views: which pairs there are, how an epoch goes through them, and the batches that carry them."""
+"""Pairs of views: evaluation protocols, the training sampler, and the batches that hold the pairs."""
 
 from __future__ import annotations
 
@@ -22,49 +22,49 @@ PROTOCOLS = ("ordered", "per_view", "ifusion")
 
 @dataclass
 class PairBatch:
-    """P pairs among I views: every view is here once, pairs point to it.
+    """P pairs among I views: each view is stored once and pairs refer to it by index.
 
-    What may be None is there where it is asked for.
+    Fields that may be None are filled on request.
     """
 
     pixels: Tensor | None  # [I, H, W, 3] (uint8), or ...
     features: Tensor | None  # ... [I, ...] that a frozen backbone computed from them
-    names: list[str]  # of the views, object/image
+    names: list[str]  # names of the views, object/image
     poses: Tensor  # [I, 3], view poses, and ...
-    cameras: Tensor  # ... [I, 4, 4], the truth: float64, always on the CPU
+    cameras: Tensor  # ... [I, 4, 4], the ground truth: float64, always on the CPU
     objects: Tensor  # [I]
-    reference: Tensor  # [P], into the views
+    reference: Tensor  # [P], indices of views
     query: Tensor  # [P]
     pairs: Tensor  # [P, 2], the same as rows of the view table
-    points: Tensor | None = None  # [I, C^2, 3] (float16) that C x C cells show, in the object's frame, NaN: nothing
-    cropped: Tensor | None = None  # [I], whether a view is a crop to the object, which has lost its distance
-    field_of_view: Tensor | None = None  # [I], radians (float64), on the CPU; None: all are crops, which have lost it
-    relative: Tensor | None = None  # see `relative_poses`, once the batch has gone to a device
+    points: Tensor | None = None  # [I, C^2, 3] (float16), seen in C x C cells, object's frame; NaN: nothing
+    cropped: Tensor | None = None  # [I], whether a view is a crop to the object, whose distance is unknown
+    field_of_view: Tensor | None = None  # [I], radians (float64), on the CPU; None: unknown, all are crops
+    relative: Tensor | None = None  # see `relative_poses`; set when the batch is moved to a device
 
     def __len__(self) -> int:
         return len(self.reference)
 
     @property
     def ids(self) -> Tensor:
-        """Integers `[P]` that name the pairs for good: hashes of the views' names, whatever else the data set holds."""
+        """Stable integer ids `[P]` of the pairs: hashes of the views' names, independent of the other data."""
         pairs = zip(self.reference.tolist(), self.query.tolist(), strict=True)
         ids = [stable_id(f"{self.names[reference]} {self.names[query]}") for reference, query in pairs]
         return torch.tensor(ids, dtype=torch.int64, device=self.reference.device)
 
     @property
     def images(self) -> Tensor:
-        """`[I, 3, H, W]` in [-1, 1], made where the pixels are: a device is sent a quarter of the bytes."""
-        assert self.pixels is not None  # a batch has features or them
+        """`[I, 3, H, W]` in [-1, 1], computed on the pixels' device to transfer a quarter of the bytes."""
+        assert self.pixels is not None  # a batch has either features or pixels
         return as_images(self.pixels)
 
     def relative_poses(self) -> Tensor:
-        """True relative poses `[P, 3]`, float32, where the pairs are."""
+        """True relative poses `[P, 3]`, float32, on the pairs' device."""
         if self.relative is None:
             return relative_pose(self.poses[self.reference], self.poses[self.query]).float()
         return self.relative
 
     def to(self, device: torch.device) -> PairBatch:
-        """The batch on a device, but for what is float64, which not every device has."""
+        """Move the batch to a device, except for float64 tensors, which some devices lack."""
         moved: dict[str, Any] = {
             name: value.to(device)
             for name, value in vars(self).items()
@@ -94,15 +94,15 @@ class ViewTable:
         return len(self.files)
 
     def views_of(self, index: int) -> NDArray[np.int64]:
-        """Numbers of the views of object `index`."""
+        """Indices of the views of object `index`."""
         return np.arange(self._starts[index], self._starts[index + 1])
 
     def pairs(self, protocol: str = "ordered", seed: int = 0) -> NDArray[np.int64]:
-        """Ordered pairs `[P, 2]` (reference, query) by a named protocol.
+        """Ordered pairs `[P, 2]` (reference, query) of a named protocol.
 
-        `ordered`: all ordered pairs of an object's views. `per_view`: each view once as query, its reference drawn
-        among the object's other views (the paper's denominators). `ifusion`: the 20 ordered pairs of the first five
-        views of an object (iFusion's script, which takes training views).
+        `ordered`: all ordered pairs of an object's views. `per_view`: each view once as the query, with a random other
+        view of its object as the reference (the paper's denominators). `ifusion`: the 20 ordered pairs of an object's
+        first five views (iFusion's script, which uses training views).
         """
         if protocol not in PROTOCOLS:
             known = f"{nearest(protocol, PROTOCOLS)} (known: {', '.join(PROTOCOLS)})"
@@ -113,7 +113,7 @@ class ViewTable:
             if len(views) < 2:
                 raise UserError(f"object '{name}' has {len(views)} view here; a pair needs two")
             if protocol == "per_view":
-                random = np.random.default_rng([seed, stable_id(name)])  # whatever else the table holds
+                random = np.random.default_rng([seed, stable_id(name)])  # independent of the other objects
                 others = [random.choice(views[views != query]) for query in views]
                 chosen.append(np.stack([np.array(others), views], axis=1))
             else:
@@ -121,8 +121,8 @@ class ViewTable:
         return np.concatenate(chosen)
 
     def view_sets(self, views: int) -> NDArray[np.int64]:
-        """Sets of `views` images of an object each, `[S, V]`: every view once as the first, followed by the next ones
-        in the table's order, the object's first again after its last."""
+        """Sets `[S, V]` of `views` images of one object: each view comes first once, followed by the next ones in the
+        table's order, wrapping around at the object's last view."""
         chosen = []
         for index, name in enumerate(self.names):
             own = self.views_of(index)
@@ -134,10 +134,10 @@ class ViewTable:
 
 @dataclass(eq=False)
 class PairData(Dataset[PairBatch]):
-    """Batches of pairs over a view table; an item is addressed by the pairs `[P, 2]` themselves.
+    """Batches of pairs over a view table, indexed by the pairs `[P, 2]` themselves.
 
-    `images` (uint8), `features`, `points` and `cropped` (see `PairBatch`), where they are given, have a row for each
-    view of the table, or more, among which `rows` are the table's. With `crop` all images are crops to the object.
+    `images` (uint8), `features`, `points` and `cropped` (see `PairBatch`), where given, have one row per view of the
+    table, or more rows, of which `rows` selects the table's. With `crop` all images are crops to the object.
     """
 
     table: ViewTable
@@ -178,14 +178,14 @@ def as_images(pixels: Tensor) -> Tensor:
 
 
 class BlockSampler(Sampler[NDArray[np.int64]]):
-    """All ordered pairs of every object once an epoch, arranged so that a batch has many pairs among few views.
+    """Samples all ordered pairs of every object once per epoch, in batches with many pairs among few views.
 
-    The views of an object are shuffled and cut into blocks of B; a unit is two blocks with the 2 B^2 pairs across
-    them (a block's own pairs ride along once); a batch is a few units, of any objects. So a view that went through
-    the backbone once serves about B pairs of its batch. The order depends on (seed, epoch) alone.
+    The views of an object are shuffled and cut into blocks of B. A unit is two blocks with the 2 B^2 pairs across them
+    (pairs within a block are added to one unit); a batch is a few units of any objects. Each view passes through the
+    backbone once and serves about B pairs of its batch. The order depends only on (seed, epoch).
 
-    Processes share the units out: each gets equally many batches, whose sizes differ by one unit at most. Units are
-    repeated only where there are fewer than batches.
+    Units are divided among processes: each gets the same number of batches, whose sizes differ by at most one unit.
+    Units are repeated only if there are fewer units than batches.
     """
 
     def __init__(
@@ -198,7 +198,7 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this at the start of every epoch."""
+        """Called by Lightning at the start of every epoch."""
         self.epoch = epoch
 
     def __len__(self) -> int:
@@ -211,7 +211,7 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
         units = [unit for index in range(len(self.table.names)) for unit in self._object_units(index, random)]
         order = random.permutation(len(units))
         batches = len(self) * self.ranks
-        order = np.resize(order, max(len(order), batches))  # repeats from the start where there are too few
+        order = np.resize(order, max(len(order), batches))  # repeats from the start if there are too few
         for chosen in np.array_split(order, batches)[self.rank :: self.ranks]:
             yield np.concatenate([units[unit] for unit in chosen])
 
@@ -225,7 +225,7 @@ class BlockSampler(Sampler[NDArray[np.int64]]):
         for i in range(len(blocks)):
             for j in range(i):
                 across = _product(blocks[i], blocks[j])
-                # Each block's own pairs ride with exactly one unit: (i, i - 1) carries block i, (1, 0) also block 0.
+                # Pairs within a block belong to exactly one unit: of block i to (i, i - 1), of block 0 to (1, 0).
                 extra = ([own[i]] if j == i - 1 else []) + ([own[0]] if (i, j) == (1, 0) else [])
                 units.append(np.concatenate([across, across[:, ::-1], *extra]))
         return units
@@ -241,12 +241,12 @@ def _within(views: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def in_batches(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    """Pairs `[P, 2]` in order, `count` at a time."""
+    """Split pairs `[P, 2]` in order, `count` per batch."""
     return [pairs[start : start + count] for start in range(0, len(pairs), count)]
 
 
 def share_out(batches: Sequence[NDArray[np.int64]], rank: int = 0, ranks: int = 1) -> list[NDArray[np.int64]]:
-    """The batches of one of several processes, which get equally many: where the number does not divide, the last ones
-    repeat earlier batches, and the metrics count a pair once."""
+    """The batches of process `rank` of `ranks`. All processes get the same number: if it does not divide evenly, the
+    last ones repeat earlier batches, and the metrics count each pair once."""
     rounds = -(-len(batches) // ranks)
     return [batches[(step * ranks + rank) % len(batches)] for step in range(rounds)]

@@ -4,10 +4,10 @@
     <root>/<object>/{train,test}/rgb/000.png ...    RGBA with a transparent background
     <root>/<object>/{train,test}/depth/000.png ...  optional, 16 bits: `DEPTH_UNIT`s along the optical axis, 0: nothing
 
-`transform_matrix` is camera-to-world (OpenGL) and is the truth; iFusion's `latlon` counts latitude downwards and is
-not read. `file_path` is relative to `rgb`, or to the folder of `transform.json`. The field of view may also be given by
-`fl_x` and `w` (pixels), and by each frame for itself. `ambiguity`, `unique_answer` and the
-depths are our own optional additions.
+`transform_matrix` is the camera-to-world matrix (OpenGL axes) and the ground truth. iFusion's `latlon`, whose latitude
+is positive downwards, is not read. `file_path` is relative to `rgb` or to the folder of `transform.json`. `fl_x` and
+`w` (pixels) may replace `camera_angle_x`, and each frame may have its own field of view. `ambiguity`, `unique_answer`
+and the depths are our optional additions.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from lp_framework.registry import register
 
 AMBIGUITIES = ("unique", "twofold", "continuous", "unlabelled")
 TRANSFORMS = "transform.json"
-FIELD_OF_VIEW_DEGREES = 49.1  # of the priors, and of views that are made here
-LARGEST_OFFSET = 0.01  # radians, and shares of a side: what of a view's intrinsics is taken for rounding
-DEPTH_UNIT = 1e-4  # scene units a level of a depth image
+FIELD_OF_VIEW_DEGREES = 49.1  # of the priors and of rendered views
+LARGEST_OFFSET = 0.01  # radians, or fraction of a side: deviations of a view's intrinsics treated as rounding
+DEPTH_UNIT = 1e-4  # scene units per level of a depth image
 
 
 @dataclass(frozen=True)
 class ObjectViews:
     """The V views of one object in one split.
 
-    `ambiguity` is one of `AMBIGUITIES`; `unique_answer` says whether a view has one right longitude (None: unknown).
-    `cameras` `[V, 4, 4]` are camera to world, `field_of_view` `[V]` is in radians.
+    `ambiguity` is one of `AMBIGUITIES`; `unique_answer` says whether a view has one correct longitude (None: unknown).
+    `cameras` `[V, 4, 4]` are camera-to-world, `field_of_view` `[V]` is in radians.
     """
 
     name: str
@@ -62,10 +62,10 @@ class ObjectViews:
 
 
 def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
-    """The views of an object in a split ("train" or "test").
+    """Read the views of an object in a split ("train" or "test").
 
     Raises `UserError`, naming the file, for a missing or malformed `transform.json`, a missing image, a matrix that is
-    not a camera looking at the origin, and pixels that are not square or not centred.
+    not a camera looking at the origin, non-square pixels and an off-centre principal point.
     """
     path = Path(root) / name / split / TRANSFORMS
     content = read_json(path)
@@ -94,7 +94,7 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
 
 
 def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -> float:
-    """The field of view (radians) of a frame, by its own intrinsics or else by those of its file; raises anything."""
+    """Field of view (radians) of a frame, from its own intrinsics or else the file's; may raise any exception."""
     every = {**content, **frame}
     own = frame if {"camera_angle_x", "fl_x"} & frame.keys() else content
     if "fl_x" not in own:
@@ -117,7 +117,7 @@ def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -
 
 
 def write_transforms(folder: Path, frames: list[dict[str, Any]], **more: Any) -> None:
-    """The `transform.json` of a split; `more` are its other entries, such as another `camera_angle_x` (radians)."""
+    """Write the `transform.json` of a split; `more` are further entries, such as another `camera_angle_x` (radians)."""
     content = {"camera_angle_x": math.radians(FIELD_OF_VIEW_DEGREES), **more, "frames": frames}
     (folder / TRANSFORMS).write_text(json.dumps(content, indent=1))
 
@@ -132,7 +132,7 @@ class ViewSource(ABC):
         """The names of the objects, sorted."""
 
     def prepare(self) -> None:  # noqa: B027
-        """Make the views that are missing in `path`, in one process; resumes after an interruption."""
+        """Create the missing views in `path`, in one process; an interrupted call can be resumed."""
 
     def views(self, name: str, split: str) -> ObjectViews:
         """The views of an object in a split ("train" or "test")."""
@@ -147,7 +147,7 @@ class RenderingsData(ViewSource):
         self.path, self.wanted = Path(path), objects
 
     def names(self) -> list[str]:
-        """The folders with a `train` or a `test` folder, as far as they are chosen."""
+        """The chosen folders among those that contain a `train` or `test` folder."""
         splits = (split for split in self.path.glob("*/*") if split.name in ("train", "test") and split.is_dir())
         names = (split.parent.name for split in splits if not split.parent.name.startswith("."))
         looked_for = f"{self.path}/OBJECT/train/{TRANSFORMS} and rgb/*.png beside it"
