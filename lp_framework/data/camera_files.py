@@ -1,7 +1,7 @@
 """Cameras for other programs: nerfstudio, instant-ngp and iFusion (`transforms.json`), COLMAP, gsplat and 3D Gaussian
 Splatting (`sparse/0`), Blender and web viewers (GLB).
 
-The world of all these files is ours, with +Y up. Pixels are square, and the optical axis meets the middle of an image.
+All files use our world coordinates, with +Y up. Pixels are square, and the principal point is the image centre.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from lp_framework.data.masks import HALF
 from lp_framework.data.photographs import EXTENT, SIZE, Box, Photograph, Prepared, exif_focal, on_white, save_upright
 from lp_framework.geometry import camera_to_world, from_opencv, inverse, level_camera, to_ifusion
 
-CELLS = 64  # across the ball from which the visual hull is carved
-REACH = 1.2  # its radius, in halves of what the reference sees at the object's distance
-FEWEST = 100  # points of a hull; masks that leave fewer do not fit together
-NEAR = 0.2  # of its distance from the origin: how far from a camera its image is drawn
-ASSUMED, ASSUMED_FOCAL = "assumed", 1.2  # longer sides of a photograph, as COLMAP assumes
-ORIGINAL = "original"  # folder of the photographs as they were taken
+CELLS = 64  # voxels across the ball from which the visual hull is carved
+REACH = 1.2  # its radius, relative to half the width that the reference sees at the object's distance
+FEWEST = 100  # points of a hull; fewer mean that the masks are inconsistent
+NEAR = 0.2  # distance of a drawn image from its camera, as a fraction of the camera's from the origin
+ASSUMED, ASSUMED_FOCAL = "assumed", 1.2  # times the longer side of a photograph, as in COLMAP
+ORIGINAL = "original"  # folder of the original photographs
 
 
 class Camera(NamedTuple):
@@ -46,8 +46,8 @@ class Camera(NamedTuple):
     height: int
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where points `[..., 3]` appear, `[..., 2]`: column and row, 0.5 and 0.5 in the middle of the first pixel; far
-        outside of the image for those behind the camera."""
+        """Project points `[..., 3]` to pixels `[..., 2]` (column, row); the first pixel's centre is (0.5, 0.5). Points
+        behind the camera land far outside the image."""
         x, y, z = np.moveaxis((points - self.matrix[:3, 3]) @ self.matrix[:3, :3], -1, 0)
         scale = self.focal / np.maximum(-z, 1e-9)
         return np.stack([self.width / 2 + scale * x, self.height / 2 - scale * y], axis=-1)
@@ -68,16 +68,16 @@ def photograph_camera(
     file: str, pose: Tensor, size: tuple[int, int], box: Box | None, focal: float, field_of_view_degrees: float
 ) -> Camera:
     """The camera of a photograph of `size` (width, height) and focal length `focal` (pixels), whose crop to the
-    object's bounding box `box` is a view with this pose `[3]` and field of view; without a box it is that view itself.
+    object's bounding box `box` is a view with this pose `[3]` and field of view; without a box it is the view itself.
 
-    The view's camera looks at the middle of the object; the photograph's stands in the same direction from it and is
-    held level. The object is taken for a ball as wide as the box is at its longer side, as in the view: the planes
-    through the camera and two edges of the box touch the ball, so its centre lies between them, and their angle tells
-    how far away it is.
+    The view's camera looks at the object's centre; the photograph's is level and in the same direction from the centre.
+    The object is approximated by a ball as wide as the box's longer side, as in the view: the planes through the camera
+    and two edges of the box touch the ball, so its centre lies midway between them, and the angle between them gives
+    its distance.
     """
     if box is None:
         return Camera(file, camera_to_world(pose.double()).numpy(), focal, *size)
-    edges = np.arctan((np.reshape(box, (2, 2)) - np.array(size) / 2) / focal)  # angles: left and top, right and bottom
+    edges = np.arctan((np.reshape(box, (2, 2)) - np.array(size) / 2) / focal)  # angles: left and top; right and bottom
     middle, half = edges.mean(axis=0), np.diff(edges, axis=0)[0] / 2  # across, down
     longer = 0 if box[2] - box[0] > box[3] - box[1] else 1
     ball = pose[2].item() * math.sin(math.atan(EXTENT / 2 / focal_length(SIZE, field_of_view_degrees)))  # its radius
@@ -88,8 +88,8 @@ def photograph_camera(
 
 
 def nerf_transforms(cameras: Sequence[Camera], poses: Tensor | None = None) -> dict[str, Any]:
-    """The contents of a `transforms.json`. Intrinsics that not all cameras share are written for each frame. With the
-    cameras' view poses `[V, 3]` a frame has iFusion's `latlon`: *down*-positive latitude and longitude in degrees,
+    """The contents of a `transforms.json`. Intrinsics that differ between cameras are written per frame. With the
+    cameras' view poses `[V, 3]`, each frame has iFusion's `latlon`: *down*-positive latitude and longitude in degrees,
     radius."""
     intrinsics = [
         {"camera_angle_x": 2 * math.atan(width / 2 / focal), "fl_x": focal, "fl_y": focal,
@@ -109,7 +109,7 @@ def colmap_model(cameras: Sequence[Camera], points: trimesh.PointCloud) -> dict[
     """A COLMAP sparse model as text (https://colmap.github.io/format.html): file name to contents.
 
     PINHOLE cameras; images (world to camera: a quaternion, scalar first, and a translation; COLMAP's axes, x right, y
-    down, z forward); points, without saying which images see them.
+    down, z forward); points, without the images that observe them.
     """
     kinds = list(dict.fromkeys(camera[2:] for camera in cameras))
     matrices = torch.from_numpy(np.stack([camera.matrix for camera in cameras]))
@@ -125,18 +125,18 @@ def colmap_model(cameras: Sequence[Camera], points: trimesh.PointCloud) -> dict[
         lines += [
             f"{number} {values} {kind} {name}",
             "",
-        ]  # the second line is for image points, of which there are none
+        ]  # the second line lists image points; there are none
     seeds = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     for number, ((x, y, z), (r, g, b, _)) in enumerate(zip(points.vertices, points.colors, strict=True), start=1):
-        seeds.append(f"{number} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} -1")  # -1: an unknown error
+        seeds.append(f"{number} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} -1")  # -1: unknown error
     contents = {"cameras.txt": pinholes, "images.txt": lines, "points3D.txt": seeds}
     return {name: "\n".join(content) + "\n" for name, content in contents.items()}
 
 
 def seed_points(cameras: Sequence[Camera], images: Sequence[Image.Image]) -> trimesh.PointCloud:
-    """Points to begin a reconstruction with: the surface of the visual hull, which is what the opacity of RGBA images
-    leaves of a ball around the origin, or the whole ball where next to nothing is left. A point has the colour of the
-    nearest camera's image there."""
+    """Points to initialize a reconstruction: the surface of the visual hull, carved by the opacity of RGBA images from
+    a ball around the origin, or the whole ball if almost nothing remains. A point has its colour in the nearest
+    camera's image."""
     centres = np.stack([camera.matrix[:3, 3] for camera in cameras])
     reach = REACH * float(np.linalg.norm(centres[0])) * cameras[0].width / 2 / cameras[0].focal
     steps = reach * ((np.arange(CELLS) + 0.5) * 2 / CELLS - 1)
@@ -144,7 +144,7 @@ def seed_points(cameras: Sequence[Camera], images: Sequence[Image.Image]) -> tri
     ball = np.linalg.norm(points, axis=1) < reach
     hull, colours = ball, []
     for camera, image in zip(cameras, images, strict=True):
-        column, row = camera.pixels(points).clip(0, np.array(image.size) - 1).astype(int).T  # outside as at the edge
+        column, row = camera.pixels(points).clip(0, np.array(image.size) - 1).astype(int).T  # outside: the edge's value
         hull = hull & (np.asarray(image)[row, column, 3] >= HALF)
         colours.append(on_white(image)[row, column])
     solid = hull.reshape(CELLS, CELLS, CELLS)
@@ -155,11 +155,11 @@ def seed_points(cameras: Sequence[Camera], images: Sequence[Image.Image]) -> tri
 
 
 def camera_scene(cameras: Sequence[Camera], images: Sequence[Image.Image], names: Sequence[str]) -> trimesh.Scene:
-    """The cameras as small frusta with their RGBA images on them; node NAME is an image, `NAME frustum` its frustum."""
+    """The cameras as small frusta showing their RGBA images; node NAME is an image, `NAME frustum` its frustum."""
     scene = trimesh.Scene()
     for (_, matrix, focal, width, height), image, name in zip(cameras, images, names, strict=True):
         distance = float(np.linalg.norm(matrix[:3, 3]))
-        sides = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # as the texture coordinates
+        sides = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # also the texture coordinates
         corners = np.c_[sides * [width / 2 / focal, height / 2 / focal], -np.ones(4)] * NEAR * distance
         corners = trimesh.transform_points(corners, matrix)
         ends = [*((matrix[:3, 3], each) for each in corners), *zip(corners, np.roll(corners, -1, axis=0), strict=True)]
@@ -193,8 +193,8 @@ def write_cameras(
 def original_focal_length(
     photograph: Photograph, prepared: Prepared, field_of_view_degrees: float
 ) -> tuple[float, str]:
-    """The focal length of a photograph in pixels, and what tells it: EXIF, or the field of view of the view that it is;
-    else it is assumed."""
+    """The focal length of a photograph in pixels and its source: EXIF, the field of view if the photograph is a view,
+    or an assumption."""
     size = photograph.image.size
     if prepared.box is None:
         return focal_length(size[0], field_of_view_degrees), "field of view"
@@ -205,8 +205,8 @@ def original_focal_length(
 def export_cameras(
     folder: Path, photographs: Mapping[int, tuple[Photograph, Prepared]], poses: Tensor, field_of_view_degrees: float
 ) -> None:
-    """Write the cameras of photographs, by number, whose views have poses `[V, 3]`: for the prepared images, which are
-    in `folder/images`, for copies of the photographs in `folder/original`, and as `cameras.glb`."""
+    """Write the cameras of numbered photographs with view poses `[V, 3]`: for the prepared images in `folder/images`,
+    for copies of the photographs in `folder/original`, and as `cameras.glb`."""
     files = {number: Path(photograph.name) for number, (photograph, _) in photographs.items()}
     images = [prepared.image for _, prepared in photographs.values()]
     views = view_cameras([f"images/{number:03d}.png" for number in files], poses, SIZE, field_of_view_degrees)

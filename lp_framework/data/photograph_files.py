@@ -1,4 +1,4 @@
-"""Which files are photographs of the object, and which are their masks."""
+"""Find the photographs of the object and their masks."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ SUFFIXES = (
     ".bmp", ".gif", ".jfif", ".jp2", ".jpe", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tga", ".tif", ".tiff", ".webp",
     ".avif",
 )  # fmt: skip
-SHOWN = 5  # names of files in a sentence
-DYNAMIC = "dynamic_mask_"  # begins the names of instant-ngp's masks, in which the background is *not* black
+SHOWN = 5  # file names listed in a message
+DYNAMIC = "dynamic_mask_"  # prefix of instant-ngp's masks, in which the background is *not* black
 
 
 def photograph_files(images: str | Path | Sequence[str | Path] | None) -> list[Path]:
-    """The image files of a folder, sorted by name (2 before 10), or those of a list, as given, without those that are
-    masks of others; at least two, or a `UserError`. Warns of files in the folder that are not read and may be
+    """The image files of a folder, sorted naturally by name (2 before 10), or of a list, in its order, without those
+    that are masks of others. `UserError` for fewer than two. Warns of unread files in the folder that may be
     photographs."""
     if images is None:
         raise UserError("images needs a value: a folder, or a list of files, images=[A.png,B.png]")
@@ -44,9 +44,9 @@ def photograph_files(images: str | Path | Sequence[str | Path] | None) -> list[P
 
 
 def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
-    """For every image its mask in `folder`; None where there is none. The mask of `front.jpg` is called `front.png` (as
-    in nerfstudio), `front.jpg.png` (COLMAP), `front_mask.png`, `front.mask.png` or `dynamic_mask_front.png`
-    (instant-ngp), or so with another suffix. `UserError` where no image has one, and where an image has two."""
+    """The mask in `folder` of every image, or None. The mask of `front.jpg` is called `front.png` (as in nerfstudio),
+    `front.jpg.png` (COLMAP), `front_mask.png`, `front.mask.png` or `dynamic_mask_front.png` (instant-ngp); other
+    suffixes are allowed. `UserError` if no image has a mask, or if an image has two."""
     folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"masks={folder}: there is no such folder")
@@ -64,7 +64,7 @@ def mask_files(files: Sequence[Path], folder: str | Path) -> list[Path | None]:
 
 def mask_beside(file: Path) -> Path | None:
     """The mask of an image where other programs put it: beside the image under one of those names, in a folder `masks`
-    there, or, of an image in a folder `images`, in the folder `masks` next to that (nerfstudio)."""
+    there or, if the image's folder is called `images`, in the folder `masks` next to it (nerfstudio)."""
     folder, stems = file.parent, _mask_stems(file)
     beside = folder.parent / "masks" if folder.name == "images" else folder / "masks"
     places = (folder, stems[1:]), (folder / "masks", stems), (beside, stems)
@@ -73,7 +73,7 @@ def mask_beside(file: Path) -> Path | None:
 
 
 def _mask_stems(file: Path) -> list[str]:
-    """What masks of an image are called, without suffix; the first is the image's own name."""
+    """Possible names of an image's masks, without suffix; the first is the image's own name."""
     others = [f"{file.stem}_mask", f"{file.stem}.mask", f"{DYNAMIC}{file.stem}"]
     return [file.stem, *others, *([file.name] if file.suffix else [])]
 
@@ -86,7 +86,7 @@ def _mask_among(masks: Sequence[Path], file: Path, stems: Sequence[str]) -> Path
 
 
 def no_mask(file: Path, folder: str | Path) -> str:
-    """What was looked for and found where an image has no mask in `folder`."""
+    """A message about an image without a mask in `folder`: what was expected and what was found."""
     names = [found.name for found in sorted(Path(folder).iterdir()) if found.name[0] != "."]
     there = listed(names) or "nothing"
     return f"{file}: has no mask; looked for {Path(folder) / file.stem}.png (or with another suffix), found {there}"
@@ -98,17 +98,17 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _as_counted(file: Path) -> tuple[list[int | str], str]:
-    """What sorts names as people count: `2.png` before `10.png`."""
+    """Key for natural sorting of names: `2.png` before `10.png`."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.stem)], file.name
 
 
 def _may_show(file: Path) -> bool:
-    """Whether a file that is not read may be a photograph: it is not known as text or as anything else."""
+    """Whether an unread file may be a photograph: its type is unknown, or an image or video."""
     kind = mimetypes.guess_type(file.name)[0] or "unknown"
     return file.is_file() and file.name[0] != "." and kind.partition("/")[0] in ("unknown", "image", "video")
 
 
 def listed(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
+    """The first few names, and how many more there are."""
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return ", ".join(names[:SHOWN]) + more

@@ -1,7 +1,7 @@
 """Renderings made to look like photographs that `data.photographs.prepare` has cut out, centred and scaled.
 
-What a person's photographs have and renderings have not: a camera that is not quite upright, other light and exposure,
-blur, the traces of JPEG, a mask that is a little wrong, and the crop to the object, which loses its distance.
+They add what real photographs have and renderings lack: a slight roll of the camera, varying light and exposure, blur,
+JPEG artefacts, a slightly wrong mask, and the crop to the object, which loses its distance.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from lp_framework.data.views import DEPTH_UNIT, ObjectViews
 from lp_framework.errors import UserError
 from lp_framework.keyed_random import stable_id
 
-ROLL_DEGREES = 10.0  # at most, to either side
-CELLS = 14  # a side of a view, of which each tells its features and a point in space
+ROLL_DEGREES = 10.0  # maximum roll to either side
+CELLS = 14  # per side of a view; each has its features and a 3-D point
 
 
 def like_photograph(
     view: NDArray[np.uint8], points: NDArray[np.float32], random: Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """RGBA `[SIZE, SIZE, 4]` and the points in space `[SIZE, SIZE, 3]` that its pixels show, of a rendering `[H, W, 4]`
-    with points `[H, W, 3]` (NaN where it shows nothing)."""
+    """Make a rendering `[H, W, 4]`, with points `[H, W, 3]` (NaN where it is empty), look like a photograph: RGBA
+    `[SIZE, SIZE, 4]` and the 3-D points `[SIZE, SIZE, 3]` seen in its pixels."""
     matrix = _to_crop(view[..., 3], math.radians(random.uniform(-ROLL_DEGREES, ROLL_DEGREES)), random)
     ground = tuple((random.uniform(0, 255) + random.uniform(-40, 40, 3)).clip(0, 255).astype(int).tolist())
     image = Image.fromarray(view)
@@ -52,15 +52,15 @@ def like_photograph(
 
 
 def _to_crop(alpha: NDArray[np.uint8], roll: float, random: Generator) -> NDArray[np.float64]:
-    """The affine map `[3, 3]` from pixels of the crop to those of a rendering, that rolls it by an angle (radians)."""
+    """The affine map `[3, 3]` from pixels of the crop to those of a rendering, rolled by an angle (radians)."""
     rows, columns = np.nonzero(alpha >= 128)
     if len(rows) == 0:
         return np.diag([alpha.shape[1] / SIZE, alpha.shape[0] / SIZE, 1.0])
     cosine, sine = math.cos(roll), math.sin(roll)
-    turn = np.array([[cosine, -sine], [sine, cosine]])  # of the crop's axes, in the rendering
-    places = np.stack([columns, rows], axis=1) @ turn  # along the crop's axes
+    turn = np.array([[cosine, -sine], [sine, cosine]])  # the crop's axes in the rendering
+    places = np.stack([columns, rows], axis=1) @ turn  # coordinates along the crop's axes
     low, high = places.min(axis=0), places.max(axis=0) + 1
-    scale = (high - low).max() / EXTENT * random.uniform(0.95, 1.05)  # rendering's pixels a pixel of the crop
+    scale = (high - low).max() / EXTENT * random.uniform(0.95, 1.05)  # pixels of the rendering per pixel of the crop
     corner = (low + high) / 2 - scale * SIZE / 2 + random.uniform(-4, 4, 2) * scale
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = turn * scale, turn @ corner
@@ -68,7 +68,7 @@ def _to_crop(alpha: NDArray[np.uint8], roll: float, random: Generator) -> NDArra
 
 
 def _lit(image: Image.Image, random: Generator) -> Image.Image:
-    """Another exposure, contrast and tint, and a light that falls off across the image."""
+    """Vary exposure, contrast and tint, and add a light that falls off across the image."""
     levels = np.asarray(image, dtype=np.float32) / 255
     y, x = np.mgrid[-1 : 1 : SIZE * 1j, -1 : 1 : SIZE * 1j].astype(np.float32)
     angle = random.uniform(0, 2 * math.pi)
@@ -79,7 +79,7 @@ def _lit(image: Image.Image, random: Generator) -> Image.Image:
 
 
 def _masked(alpha: Image.Image, random: Generator) -> Image.Image:
-    """A mask that is a little too wide or too narrow, and soft; sometimes the exact one."""
+    """Make the mask a little too wide or too narrow, and soft; sometimes keep it exact."""
     reach = int(random.integers(-2, 3))
     if reach > 0:
         alpha = alpha.filter(ImageFilter.MaxFilter(2 * reach + 1))
@@ -89,7 +89,7 @@ def _masked(alpha: Image.Image, random: Generator) -> Image.Image:
 
 
 def _warped(points: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The points at the pixels of the crop, of the nearest pixel of the rendering."""
+    """The points at the pixels of the crop, from the nearest pixel of the rendering."""
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
     x, y = np.tensordot(matrix[:2, :2], np.stack([columns, rows]), axes=1) + matrix[:2, 2][:, None, None]
     x, y = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -102,10 +102,10 @@ def _warped(points: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray
 def decoded_renderings(
     views: Sequence[ObjectViews], share: float, size: int, folder: str | Path
 ) -> tuple[str, np.memmap]:
-    """Key and array `[N]` of renderings with depth; those of `share` of the objects are made to look like photographs.
+    """Key and array `[N]` of renderings with depth; `share` of the objects are made to look like photographs.
 
-    A row has `pixels` (size, size, 3), uint8 on white; `points` (CELLS^2, 3), float16, that its cells show, in the
-    object's frame, NaN where there is nothing; and `cropped`, whether it was made to look like a photograph.
+    A row has `pixels` (size, size, 3), uint8 on white; `points` (CELLS^2, 3), float16, seen in its cells, in the
+    object's frame, NaN where empty; and `cropped`, whether it was made to look like a photograph.
     """
     files = [file for each in views for file in each.files]
     depths = [file.parents[1] / "depth" / file.name for file in files]
@@ -141,7 +141,7 @@ def decoded_renderings(
 
 
 def _points(levels: Image.Image, camera: NDArray, field_of_view: float) -> NDArray[np.float32]:
-    """The points `[H, W, 3]` in space that the pixels of a depth image show, NaN where there is nothing."""
+    """The 3-D points `[H, W, 3]` seen in the pixels of a depth image, NaN where it is empty."""
     depth = np.asarray(levels).astype(np.float32) * np.float32(DEPTH_UNIT)
     height, width = depth.shape
     slope = math.tan(field_of_view / 2)
@@ -154,10 +154,10 @@ def _points(levels: Image.Image, camera: NDArray, field_of_view: float) -> NDArr
 
 
 def _in_cells(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means `[CELLS^2, 3]` of the points `[H, W, 3]` over the cells, of every third pixel each way."""
+    """Means `[CELLS^2, 3]` of the points `[H, W, 3]` in each cell, using every third pixel in both directions."""
     bounds = np.linspace(0, len(points), CELLS + 1).round().astype(int)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of cells that show nothing
+        warnings.simplefilter("ignore", RuntimeWarning)  # from empty cells
         cells = [
             np.nanmean(points[top:bottom:3, left:right:3].reshape(-1, 3), axis=0)
             for top, bottom in itertools.pairwise(bounds)

@@ -1,13 +1,12 @@
-"""Photographs of one object, prepared as the priors and models know views: upright, cut out, centred, square, on white.
+"""Photographs of one object, prepared as the priors and models expect: upright, cut out, centred, square, on white.
 
-Where the object is, a mask file says, an image's own alpha channel, or a mask that is made (see `data.masks`). The crop
-is that of Zero123's demo (`load_and_preprocess`): the longest side of the object's bounding box becomes 200 of the
-image's 256 pixels, its centre the image's. Background is what is less than half opaque, as in the code of iFusion and
-ID-Pose.
+A mask file, the image's own alpha channel or a generated mask (see `data.masks`) marks the object. The crop is that of
+Zero123's demo (`load_and_preprocess`): the object's bounding box is centred and its longest side scaled to 200 of the
+image's 256 pixels. Pixels less than half opaque are background, as in the code of iFusion and ID-Pose.
 
-The prepared image is, nearly, that of a *virtual* camera with the field of view of the priors at the same viewpoint,
-turned to the object's centre and moved until the object fills that share of the frame. So latitude and longitude are
-the photograph's, distance and focal length are lost, and a relative radius compares two virtual cameras.
+The prepared image approximates that of a *virtual* camera with the priors' field of view at the same viewpoint, turned
+towards the object's centre and moved until the object fills that fraction of the frame. Latitude and longitude are
+therefore the photograph's; distance and focal length are lost, and a relative radius compares two virtual cameras.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ from lp_framework.errors import UserError
 log = logging.getLogger(__name__)
 
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
-SMALLEST = 16  # pixels; a smaller object in a photograph says too little
-CUT_OFF = 0.1  # of the object's longest side: along the border, so much of it is no touch but a cut
+SMALLEST = 16  # pixels; a smaller object shows too little detail
+CUT_OFF = 0.1  # of the object's longest side: more along the border means that the object is cut off
 EMPTY = "its mask is empty, nothing in it is at least half opaque"
 FULL_FRAME = math.hypot(36, 24)  # mm: the diagonal of 35 mm film
 RESOLUTION_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # mm, by EXIF's FocalPlaneResolutionUnit
@@ -47,7 +46,7 @@ Box = tuple[int, int, int, int]  # left, top, right, bottom
 
 @contextmanager
 def opened(file: str | Path) -> Iterator[Image.Image]:
-    """An image file, of which only the head has been read; `UserError` naming the file where it cannot be read."""
+    """Open an image file, reading only its header; `UserError` naming the file if it cannot be read."""
     if Path(file).is_dir():
         raise UserError(f"{file}: is a folder; give an image file")
     with expecting(f"{file}: is not a readable image"), Image.open(file) as image:
@@ -55,9 +54,8 @@ def opened(file: str | Path) -> Iterator[Image.Image]:
 
 
 def read_mask(file: str | Path) -> Image.Image:
-    """A mask file, turned as its EXIF orientation says: RGB or RGBA, or the numbers that it holds (see
-    `masks.mask_opacity`), and the opposite of one of instant-ngp's; `UserError` naming the file where it cannot be
-    read."""
+    """Read a mask file and apply its EXIF orientation: as RGB or RGBA, or the raw values (see `masks.mask_opacity`);
+    instant-ngp's masks are inverted. `UserError` naming the file if it cannot be read."""
     with opened(file) as opened_mask:
         mask = ImageOps.exif_transpose(opened_mask)
         if Path(file).name.startswith(DYNAMIC):
@@ -69,24 +67,24 @@ def read_mask(file: str | Path) -> Image.Image:
 
 
 def read_image(file: str | Path) -> Image.Image:
-    """An image file as `upright` has it; `UserError` naming the file where it cannot be read."""
+    """Read an image file as `upright` returns it; `UserError` naming the file if it cannot be read."""
     with opened(file) as image:
         return upright(image)
 
 
 def upright(image: Image.Image) -> Image.Image:
-    """An image of any mode, with 8 bits, turned as its EXIF orientation says: RGBA where it has transparency, else RGB.
-    Raises `ValueError` for a mode whose white is not known (floating point)."""
+    """Convert an image of any mode to 8 bits and apply its EXIF orientation: RGBA if it has transparency, else RGB.
+    Raises `ValueError` for a mode whose white level is unknown (floating point)."""
     image = eight_bit(ImageOps.exif_transpose(image))
     return image.convert("RGBA" if image.has_transparency_data else "RGB")
 
 
 def exif_focal(image: Image.Image) -> float | None:
-    """The focal length in pixels that the EXIF data of an image with square pixels tells, None where it tells none: by
-    the equivalent on 35 mm film, whose diagonal is the image's (CIPA DCG-001), or by the pixels of the sensor."""
+    """The focal length in pixels from the EXIF data of an image with square pixels, None if unknown: from the 35 mm
+    equivalent, with the film's diagonal as the image's (CIPA DCG-001), or from the sensor's pixels."""
     try:
         exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    except Exception:  # of damaged data, for which Pillow raises anything
+    except Exception:  # damaged data, for which Pillow raises any exception
         return None
 
     def number(tag: ExifTags.Base) -> float:
@@ -103,8 +101,8 @@ def exif_focal(image: Image.Image) -> float | None:
 
 
 def save_upright(file: Path, copy: Path) -> None:
-    """Copy an image file; one with an EXIF orientation, which most programs do not look at, is turned by it, and loses
-    its EXIF data."""
+    """Copy an image file. If it has an EXIF orientation, which most programs ignore, apply it and drop the EXIF
+    data."""
     with opened(file) as image, written(copy) as partial:
         if image.getexif().get(ExifTags.Base.Orientation, 1) == 1:
             shutil.copyfile(file, partial)
@@ -114,7 +112,7 @@ def save_upright(file: Path, copy: Path) -> None:
 
 
 def array_image(array: ArrayLike, name: str) -> Image.Image:
-    """The image of an array `[H, W, 3 | 4]`: uint8, or floats in [0, 1]."""
+    """Convert an array `[H, W, 3 | 4]`, uint8 or floats in [0, 1], to an image."""
     values: NDArray[Any] = np.asarray(array)
     if values.ndim != 3 or values.shape[2] not in (3, 4) or not values.size:
         raise UserError(f"{name} must be [H, W, 3] or [H, W, 4], got {list(values.shape)}")
@@ -132,11 +130,11 @@ def cut_out(
     remove_background: bool = False,
     required: bool = True,
 ) -> Image.Image:
-    """The image as RGBA with its background transparent: by `mask` if given, else its alpha channel, else with
-    `remove_background` by a mask that is made.
+    """Convert an image to RGBA with a transparent background: from `mask` if given, else the alpha channel, else with
+    `remove_background` a generated mask.
 
-    `UserError`, which calls the image `name`, for a mask of another size or without background, and where none of the
-    three is to be had; that leaves the whole image opaque unless it is `required`.
+    `UserError`, which calls the image `name`, for a mask of another size or without background. If none of the three is
+    available, `UserError` if `required`, else the whole image stays opaque.
     """
     opacity = None
     if mask is not None:
@@ -161,7 +159,7 @@ def cut_out(
 
 
 def made_mask(image: Image.Image, name: str) -> Image.Image:
-    """A mask ("L") of an image's object, see `data.masks`; `UserError` where no background is found."""
+    """Generate a mask ("L") of an image's object, see `data.masks`; `UserError` if no background is found."""
     maker = mask_maker()
     mask = maker.mask(image.convert("RGB"))
     if alpha_opacity(mask) is None:
@@ -170,15 +168,15 @@ def made_mask(image: Image.Image, name: str) -> Image.Image:
 
 
 class Prepared(NamedTuple):
-    """A prepared image, and the object's bounding box in the one that it was cropped from, None without a crop."""
+    """A prepared image, and the object's bounding box in the image before cropping, None without a crop."""
 
     image: Image.Image
     box: Box | None
 
 
 def crop_to_object(image: Image.Image, name: str) -> Prepared:
-    """RGBA of `SIZE` pixels a side with the object in the middle, its longest side `EXTENT` pixels (see the module);
-    stray parts far from the object are left out."""
+    """Crop to RGBA of `SIZE` pixels a side with the object centred, its longest side `EXTENT` pixels (see the module);
+    stray parts far from the object are removed."""
     opacity = without_strays(image.getchannel("A"), name)
     opaque = np.asarray(opacity) >= HALF
     box = Image.fromarray(opaque).getbbox()
@@ -209,8 +207,8 @@ def crop_to_object(image: Image.Image, name: str) -> Prepared:
 def prepare(
     image: Image.Image, name: str, mask: Image.Image | None = None, remove_background: bool = False, crop: bool = True
 ) -> Image.Image:
-    """RGBA of `SIZE` pixels a side: by `cut_out` and `crop_to_object`, or, without `crop`, the whole image, which must
-    be square; one without background then shows the object on white."""
+    """Prepare an image as RGBA of `SIZE` pixels a side, by `cut_out` and `crop_to_object`. Without `crop`, resize the
+    whole image, which must be square; without a background it must show the object on white."""
     if crop:
         return crop_to_object(cut_out(image, name, mask, remove_background), name).image
     if image.width != image.height:
@@ -220,7 +218,7 @@ def prepare(
 
 
 class Photograph(NamedTuple):
-    """An image file, read, with its mask, if any, and whether that was made here."""
+    """An image that was read, its mask, if any, and whether that mask was generated."""
 
     name: str
     image: Image.Image
@@ -228,7 +226,7 @@ class Photograph(NamedTuple):
     made: bool
 
     def prepared(self, crop: bool) -> Prepared:
-        """See `prepare`."""
+        """Prepare the photograph, see `prepare`."""
         if crop:
             return crop_to_object(cut_out(self.image, self.name, self.mask), self.name)
         return Prepared(prepare(self.image, self.name, self.mask, crop=False), None)
@@ -237,9 +235,9 @@ class Photograph(NamedTuple):
 def read_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
 ) -> list[Photograph]:
-    """Image files with their masks: those in the folder `masks`; without it, of images without alpha channel, those of
-    `mask_beside`; and, with `remove_background`, masks that are made for images that have neither. All images are read
-    before that begins."""
+    """Read image files and their masks: from the folder `masks`; without it, from `mask_beside` for images without
+    alpha channel; with `remove_background`, generated for images that have neither. All images are read before masks
+    are generated."""
     for name, value in (("remove_background", remove_background), ("crop", crop)):
         if not isinstance(value, bool):
             raise UserError(f"{name} must be true or false, got {value}")
@@ -266,17 +264,17 @@ def read_photographs(
 def prepared_photographs(
     files: Sequence[Path], masks: str | Path | None, remove_background: bool, crop: bool
 ) -> list[Image.Image]:
-    """Image files as `prepare` has them; see `read_photographs`."""
+    """Read and `prepare` image files; see `read_photographs`."""
     return [each.prepared(crop).image for each in read_photographs(files, masks, remove_background, crop)]
 
 
 def on_white(image: Image.Image) -> NDArray[np.uint8]:
-    """Pixels `[H, W, 3]` of an RGBA image composed over white."""
+    """Compose an RGBA image over white: pixels `[H, W, 3]`."""
     white = Image.new("RGBA", image.size, "white")
     return np.asarray(Image.alpha_composite(white, image).convert("RGB"))
 
 
 def save_png(path: Path, image: Image.Image) -> None:
-    """Write an image whole or not at all."""
+    """Write a PNG file atomically."""
     with written(path) as partial:
         image.save(partial, "PNG")
