@@ -1,7 +1,7 @@
 """Arrays computed once and memory-mapped afterwards: decoded views, features of frozen backbones.
 
-An array lies in `<key>.npy` with a checksum in `<key>.json`, which is written last. A file that is cut short or
-altered does not match its checksum and is made anew.
+An array is stored in `<key>.npy`, with a checksum in `<key>.json`, which is written last. A truncated or altered file
+does not match its checksum and is computed again.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ T = TypeVar("T")
 
 
 def cached_array(folder: str | Path, key: str, count: int, blocks: Callable[[], Iterable[NDArray]]) -> np.memmap:
-    """The array `[count, ...]` of a key, read-only and memory-mapped; where it is missing or damaged, it is made
-    from `blocks`, which are `[n, ...]` of any one shape and type."""
+    """The read-only, memory-mapped array `[count, ...]` of a key; if missing or damaged, it is computed from `blocks`
+    `[n, ...]` of the same shape and type."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ def _write(folder: Path, key: str, count: int, blocks: Iterable[NDArray]) -> Non
             if array is None:
                 shape = (count, *block.shape[1:])
                 array = np.lib.format.open_memmap(partial, mode="w+", dtype=block.dtype, shape=shape)
-                if hasattr(os, "posix_fallocate"):  # not on macOS; a mapped page that finds the disk full is a SIGBUS
+                if hasattr(os, "posix_fallocate"):  # not on macOS; prevents a SIGBUS on a full disk
                     with partial.open("r+b") as file:
                         os.posix_fallocate(file.fileno(), 0, partial.stat().st_size)
             array[place : place + len(block)] = block
@@ -77,7 +77,7 @@ def _intact(folder: Path, key: str, count: int) -> bool:
         array = np.load(folder / f"{key}.npy", mmap_mode="r")
         expected = record["shape"] == list(array.shape) and record["dtype"] == array.dtype.str and len(array) == count
         return bool(expected) and _checksum(array) == record["checksum"]
-    except Exception:  # damaged files raise anything from EOFError to SyntaxError
+    except Exception:  # damaged files raise any exception from EOFError to SyntaxError
         return False
 
 
@@ -86,14 +86,14 @@ def _checksum(array: NDArray) -> int:
 
 
 def tracked(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
-    """The items, with a progress bar on the terminal while they last; nothing is printed elsewhere."""
+    """Iterate over items with a progress bar that disappears at the end; only terminals show it."""
     console = Console(stderr=True)
     return track(items, description, total, console=console, transient=True, disable=not console.is_terminal)
 
 
 def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bool = False) -> tuple[str, np.memmap]:
-    """Key of the content and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized;
-    decoded once by a version of this program. With `crop` the object is centred and scaled as that of a photograph, by
+    """Key of the content and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized. The
+    result is cached until the decoding changes. With `crop` the object is centred and scaled like a photograph's, by
     the alpha channel (see `prepare`).
 
     `UserError` for an image that does not decode or is not square."""
@@ -115,7 +115,7 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
 
 
 def sample_images() -> list[Image.Image]:
-    """An image with a soft edge around an object in it, and a grey one of 16 bits."""
+    """An image of an object with a soft edge, and a 16-bit greyscale image."""
     ramp = np.arange(64 * 64, dtype=np.uint16).reshape(64, 64) * 16
     opacity = (24 - np.hypot(*np.mgrid[-31.5:32, -31.5:32])) * 32
     soft = np.dstack([ramp / 257, ramp.T / 257, ramp % 256, opacity.clip(0, 255)]).astype(np.uint8)
@@ -123,8 +123,8 @@ def sample_images() -> list[Image.Image]:
 
 
 def answered_key(key: str, answers: Iterable[NDArray]) -> str:
-    """The key of what a decoder makes of the files of `key`, which changes with what it makes of samples: its
-    `answers`. So arrays that an earlier version decoded otherwise are not taken."""
+    """Extend `key` by a decoder's outputs for sample images, its `answers`, so that arrays decoded differently by an
+    earlier version are not used."""
     return content_key([], key, [hashlib.blake2b(answer.tobytes(), digest_size=8).hexdigest() for answer in answers])
 
 

@@ -1,10 +1,10 @@
-"""Files read and folders written: whatever is wrong with one is told in a sentence that names it.
+"""Reading files and writing folders, with errors that name the file and say what is wrong.
 
-An object's folder of views is complete or absent, whatever stops the run: it is written as a hidden folder that is
-renamed when all of it is there. A record beside the views says what they were made from, so that they are not taken for
-those of other files of the same names (see `Origin`). `objects.json` in the folder
-of all, `{"chosen": {how}, "seen": [names], "unseen": [names]}`, keeps which objects were chosen: a later run, with more
-of the data set downloaded, has the same.
+An object's folder of views is complete or absent even if the run is interrupted: it is written as a hidden folder and
+renamed when complete. A record beside the views identifies their source files, so that they are not mistaken for views
+of other files with the same names (see `Origin`). `objects.json` in the parent folder,
+`{"chosen": {how}, "seen": [names], "unseen": [names]}`, keeps the choice of objects: a later run uses the same objects
+even if more of the data set has been downloaded.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from lp_framework.errors import UserError, nearest
 from lp_framework.geometry import is_rotation, spherical_residual
 
 LIST = "objects.json"
-LARGEST_RESIDUAL = 1.0  # degrees; a camera further from a spherical one is refused
-SHOWN = 5  # names in a sentence, and lines in a list of failures
+LARGEST_RESIDUAL = 1.0  # degrees; cameras that deviate more from a spherical one are rejected
+SHOWN = 5  # names in a message, and lines in a list of failures
 
 
 def read_json(file: Path) -> Any:
-    """The content of a JSON file, of a gzipped one (.jgz) too."""
+    """Read a JSON file, gzipped (.jgz) or not."""
     zipped = file.suffix == ".jgz"
     with expecting(f"{file}: is not readable {'gzipped ' if zipped else ''}JSON"):
         content = file.read_bytes()
@@ -45,20 +45,20 @@ def read_json(file: Path) -> Any:
 
 @contextmanager
 def expecting(sentence: str) -> Iterator[None]:
-    """Make `UserError`, with what `sentence` says is wanted, of what goes wrong in reading or taking apart."""
+    """Convert any exception while reading or parsing to a `UserError` with `sentence`, which says what is expected."""
     try:
         yield
     except UserError:
         raise
     except FileNotFoundError as error:
         raise UserError(f"{error.filename or error}: there is no such file") from error
-    except Exception as error:  # parsers raise anything from KeyError to struct.error
+    except Exception as error:  # parsers raise any exception from KeyError to struct.error
         reason = " ".join(str(error).split())
         raise UserError(f"{sentence} ({type(error).__name__}: {reason})") from error
 
 
 def names_below(root: Path, names: Iterable[str], what: str, looked_for: object) -> list[str]:
-    """Names found in a folder, sorted, each once; `UserError` where there is no such folder and where it has none."""
+    """Sorted unique names found in a folder; `UserError` if the folder does not exist or contains none."""
     if not root.is_dir():
         raise UserError(f"{root}: there is no such folder of {what}; give data.path=FOLDER")
     found = sorted({*names})
@@ -68,8 +68,8 @@ def names_below(root: Path, names: Iterable[str], what: str, looked_for: object)
 
 
 def chosen(names: Sequence[str], wanted: str | Sequence[str] | None, where: object) -> list[str]:
-    """The objects that `data.objects` names (`wanted`), sorted; all for None. `UserError` for one that is not among the
-    `names`, which are those in `where`."""
+    """The objects selected by `data.objects` (`wanted`), sorted; all for None. `UserError` for one that is not in
+    `names`, the objects available in `where`."""
     if wanted is None:
         return sorted(names)
     found = sorted({wanted} if isinstance(wanted, str) else {*wanted})
@@ -92,7 +92,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def numbers(values: Any, *shape: int) -> Tensor:
-    """A tensor (float64) of finite numbers of this shape; raises anything, so it is called within `expecting`."""
+    """A tensor (float64) of finite numbers of this shape; may raise any exception, so call it within `expecting`."""
     tensor = torch.as_tensor(values, dtype=torch.float64)
     if tensor.shape != shape or not tensor.isfinite().all():
         raise ValueError(f"these are not {' x '.join(map(str, shape))} finite numbers")
@@ -100,7 +100,7 @@ def numbers(values: Any, *shape: int) -> Tensor:
 
 
 def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:
-    """`UserError` unless a camera `[4, 4]` is rigid, off the origin, looks at it, and stands upright."""
+    """`UserError` unless a camera `[4, 4]` is rigid, not at the origin, looks at the origin and is upright."""
     if not is_rotation(camera[:3, :3]) or (camera[3] - camera.new_tensor([0, 0, 0, 1])).abs().max() >= 1e-3:
         raise UserError(f"{where} is not a rigid camera-to-world transform")
     if not 1e-6 < camera[:3, 3].norm() < torch.inf:
@@ -113,7 +113,7 @@ def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:
 
 @contextmanager
 def locked(folder: Path, lock: str) -> Iterator[None]:
-    """Have a folder to oneself, made if need be: runs that make views in one folder take turns."""
+    """Lock a folder, created if needed, so that runs that create views in it take turns."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / lock):
@@ -122,9 +122,9 @@ def locked(folder: Path, lock: str) -> Iterator[None]:
 
 @contextmanager
 def written_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder beside `folder` to write to; it takes its name at the end, and is removed where that fails."""
+    """A hidden folder beside `folder` to write to; renamed to `folder` at the end, or removed on failure."""
     partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a run that was killed
+    shutil.rmtree(partial, ignore_errors=True)  # left by a killed run
     try:
         with writing(folder):
             partial.mkdir(parents=True)
@@ -135,7 +135,7 @@ def written_folder(folder: Path) -> Iterator[Path]:
 
 
 def content_key(files: Iterable[Path], *facts: object) -> str:
-    """A key for what is computed from the bytes of `files`, in their order, and from `facts`."""
+    """A key for results computed from the bytes of `files`, in order, and from `facts`."""
     digest = hashlib.blake2b(repr(facts).encode(), digest_size=16)
     for file in files:
         try:
@@ -147,8 +147,8 @@ def content_key(files: Iterable[Path], *facts: object) -> str:
 
 @dataclass(frozen=True)
 class Origin:
-    """The files that an object's views are made from, others `beside` them that may belong to several objects, and the
-    axis that is `up` in them."""
+    """The source files of an object's views, files `beside` them that several objects may share, and their `up`
+    axis."""
 
     files: Sequence[Path]
     beside: Origin | None = None
@@ -156,27 +156,27 @@ class Origin:
 
     @cached_property
     def content(self) -> str:
-        """A text that changes with the names and bytes of the files."""
+        """A hash of the names and bytes of the files."""
         return content_key(self.files, [file.name for file in self.files], self.beside and self.beside.content, self.up)
 
     @cached_property
     def stamp(self) -> str:
-        """A text that changes with their places, sizes and times, which costs no reading."""
+        """A hash of their paths, sizes and times, computed without reading them."""
         stats = [(os.path.abspath(file), file.stat()) for file in self.files]
         facts = [(path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for path, stat in stats]
         return content_key([], facts, self.beside and self.beside.stamp, self.up)
 
     def record(self) -> dict[str, str]:
-        """What a record is to keep of the files."""
+        """What a record stores about the files."""
         return {"content": self.content, "stamp": self.stamp}
 
     def is_of(self, record: Any) -> bool:
-        """Whether a record is of these files; they are read where they are not where and as they were."""
+        """Whether a record matches these files, which are read only if a path, size or time has changed."""
         return isinstance(record, dict) and (record.get("stamp") == self.stamp or record.get("content") == self.content)
 
 
 def read_record(file: Path) -> dict[str, Any]:
-    """The content of a record; empty where there is none that can be read."""
+    """Read a record; empty if it is missing or unreadable."""
     try:
         content = json.loads(file.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -185,7 +185,7 @@ def read_record(file: Path) -> dict[str, Any]:
 
 
 def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """What of a record is not as wanted, empty where all of it is.
+    """Describe how a record differs from the wanted values; empty if it does not.
 
     >>> differences({"seed": 0, "views": 8}, {"seed": 1, "views": 8})
     'seed was 0, is 1'
@@ -195,8 +195,8 @@ def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
 
 
 def raise_failures(failures: Mapping[str, str], objects: int, done: str) -> None:
-    """One `UserError` for all objects of which one was raised, by name: what they share is said once, of many different
-    messages the first few are listed."""
+    """Raise one `UserError` for all failed objects, by name: equal messages are merged, and of many different ones only
+    the first few are listed."""
     names: dict[str, list[str]] = {}
     for name, message in failures.items():
         names.setdefault(message, []).append(name)
@@ -210,14 +210,14 @@ def raise_failures(failures: Mapping[str, str], objects: int, done: str) -> None
 
 
 class ObjectLists(NamedTuple):
-    """Names of the objects to train on (`seen`) and of those kept for evaluation (`unseen`), each sorted."""
+    """Names of the training objects (`seen`) and of those held out for evaluation (`unseen`), each sorted."""
 
     seen: list[str]
     unseen: list[str]
 
 
 def drawn(available: Sequence[str], seen: int | None, unseen: int, seed: int, where: Path) -> ObjectLists:
-    """A seeded choice of `seen` (None: all other) and `unseen` objects; `UserError` naming the place for too few."""
+    """A seeded choice of `seen` (None: all other) and `unseen` objects; `UserError` naming `where` for too few."""
     names = sorted(available)
     if seen is None:
         seen = max(len(names) - unseen, 1)
@@ -232,8 +232,8 @@ def drawn(available: Sequence[str], seen: int | None, unseen: int, seed: int, wh
 
 
 def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectLists]) -> ObjectLists:
-    """The lists in the folder `views`, chosen and written there where there are none yet; `UserError` where those that
-    are there were chosen otherwise than `how` (plain values) says."""
+    """The lists in the folder `views`, chosen and written there on first use; `UserError` if they were chosen with
+    settings other than `how` (plain values)."""
     path = views / LIST
     if not path.exists():
         lists = choose()

@@ -1,7 +1,6 @@
-"""Meshes: loading a file, normalising it, and the surfaces that the renderers draw.
+"""Meshes: loading and normalising files, and the surfaces that the renderers draw.
 
-Normalised is a scene whose bounding box has its centre at the origin and a longest side of 1 (the paper, Dataset
-Construction).
+A normalised scene has a bounding box centred at the origin with a longest side of 1 (the paper, Dataset Construction).
 """
 
 from __future__ import annotations
@@ -37,20 +36,20 @@ from lp_framework.errors import UserError
 
 Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
 
-NEUTRAL_GREY = 0.6  # linear reflectance of what has neither texture nor colour
-CREASE_ANGLE = np.radians(40)  # edges that bend less are shaded smooth
-LARGEST_TEXTURE = 2048  # pixels a side; finer detail than the views can show
-UP_AXES = {".glb": "y", ".gltf": "y", ".3mf": "z"}  # of formats whose standard says which axis points up
+NEUTRAL_GREY = 0.6  # linear reflectance of parts without texture or colour
+CREASE_ANGLE = np.radians(40)  # edges that bend less are shaded smoothly
+LARGEST_TEXTURE = 2048  # pixels a side, finer than the views can show
+UP_AXES = {".glb": "y", ".gltf": "y", ".3mf": "z"}  # of formats with a standardized up axis
 
 
 @dataclass(frozen=True)
 class MeshObject:
-    """One object of a data source: its name, its ambiguity class, and what loads its normalised scene.
+    """One object of a data source: its name, its ambiguity class, and a function that loads its normalised scene.
 
-    `load` travels to worker processes: a module-level function or a `functools.partial` of one. `unique_answer` says
-    whether a view has one right longitude: shapes without symmetry and two-fold ones, whose texture tells, have (the
-    default), bodies of revolution only with a texture that tells; None where nobody has looked. `origin` has the files
-    that it is made from, where they are at hand.
+    `load` is sent to worker processes: a module-level function or a `functools.partial` of one. `unique_answer` says
+    whether a view has one correct longitude: by default, asymmetric shapes and two-fold ones, resolved by their
+    texture, have one; bodies of revolution need a texture that resolves it; None is unknown. `origin` has the source
+    files, if available.
     """
 
     name: str
@@ -66,35 +65,35 @@ class MeshObject:
 
 @dataclass(frozen=True)
 class Surface:
-    """T triangles of one material in the scene's frame; corner `3 i + j` is the j-th of triangle i, none is shared.
+    """T triangles of one material in the scene's frame; corner `3 i + j` is the j-th of triangle i; none is shared.
 
     Colours multiply: the texture (sRGB, decoded by the renderers), `colour` and `corner_colours` (both linear).
     """
 
     positions: NDArray[np.float32]  # [3T, 3]
-    normals: NDArray[np.float32]  # [3T, 3], unit, on the side from which the corners run counter-clockwise
-    twins: NDArray[np.int64]  # [T], index among the triangles of all surfaces of the one that backs this one, or -1
+    normals: NDArray[np.float32]  # [3T, 3], unit, towards the side from which corners run counter-clockwise
+    twins: NDArray[np.int64]  # [T], index (over all surfaces) of the triangle that backs this one, or -1
     colour: NDArray[np.float32]  # [3]
     corner_colours: NDArray[np.float32] | None  # [3T, 3]
-    texture: NDArray[np.uint8] | None = None  # [h, w, 3], powers of two, first row on top
+    texture: NDArray[np.uint8] | None = None  # [h, w, 3], sides are powers of two, first row at the top
     texture_coordinates: NDArray[np.float32] | None = None  # [3T, 2], v upwards
-    wrap: NDArray[np.int64] | None = None  # [2], how it goes on across and up (OpenGL's numbers); None: repeats
+    wrap: NDArray[np.int64] | None = None  # [2], wrap mode across and up (OpenGL's constants); None: repeat
 
 
 def load_scene(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] = ()) -> trimesh.Scene:
-    """The normalised scene of a mesh file (glb, obj, ply, stl, off, ...), whose axis `up` becomes our +Y.
+    """Load the normalised scene of a mesh file (glb, obj, ply, stl, off, ...), whose axis `up` becomes our +Y.
 
-    Textures and materials are looked for beside it and in `folders`. Warns of what is not drawn as the file has it, and
-    where part of it has no colour. Raises `UserError` naming the file when it is missing, does not load, needs what is
-    not supported, has no faces or has no extent.
+    Textures and materials are searched for beside it and in `folders`. Warns of anything not drawn as in the file and
+    of parts without colour. Raises `UserError` naming the file if it is missing, does not load, needs unsupported
+    features, or has no faces or no extent.
     """
     if not path.is_file():
         raise UserError(f"{path}: there is no such mesh file")
     with expecting(f"{path}: does not load as a mesh"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # of large textures
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # from large textures
         scene = read_mesh(path, (path.parent, *folders))
         if up == "z":
-            scene.apply_transform(np.eye(4)[[1, 2, 0, 3]])  # as `real_cameras.z_up_to_y_up` does it
+            scene.apply_transform(np.eye(4)[[1, 2, 0, 3]])  # same as `real_cameras.z_up_to_y_up`
         scene = normalise(scene)
     axis = UP_AXES.get(path.suffix.lower(), up)
     if axis != up:
@@ -109,7 +108,7 @@ def load_scene(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] 
 
 def normalise(scene: trimesh.Scene) -> trimesh.Scene:
     """A copy with the bounding box centred at the origin and its longest side 1, all transforms applied, without points
-    and paths. Raises `ValueError` when no faces, no extent or no area remain."""
+    and paths. Raises `ValueError` if no faces, no extent or no area remain."""
     meshes = _meshes(scene)
     if not meshes:
         raise ValueError("it has no faces")
@@ -130,7 +129,7 @@ def _meshes(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
 
 
 def fingerprint(scene: trimesh.Scene) -> str:
-    """A hash of everything of a scene that its rendering depends on."""
+    """A hash of everything in a scene that affects its rendering."""
     digest = hashlib.sha256()
     for surface in surfaces(scene):
         for array in vars(surface).values():
@@ -141,18 +140,18 @@ def fingerprint(scene: trimesh.Scene) -> str:
 
 
 def surfaces(scene: trimesh.Scene) -> list[Surface]:
-    """What a scene looks like, one `Surface` a mesh.
+    """Convert a scene to surfaces, one `Surface` per mesh.
 
-    Normals follow from the shape alone: smooth across edges that bend less than `CREASE_ANGLE`, seams of the texture
-    included, whatever normals the file has. Metalness, normal maps and transparency are left out. Of triangles that
-    coincide, and look the same way, the first is kept: which of them won would be chance.
+    Normals are computed from the shape alone and ignore those of the file: they are smooth across edges, including
+    texture seams, that bend less than `CREASE_ANGLE`. Metalness, normal maps and transparency are ignored. Of
+    coinciding triangles that face the same way only the first is kept, because which one is visible would be arbitrary.
     """
     meshes = _meshes(scene)
     mesh_of_triangle = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
     face_of_triangle = np.concatenate([np.arange(len(mesh.faces)) for mesh in meshes])
     points = _weld(np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)).reshape(-1, 3)
     degenerate = (points == np.roll(points, 1, axis=1)).any(axis=1)
-    # Each begun at its lowest index and otherwise in the same order.
+    # Rotate each to start at its lowest index, keeping the order.
     points = points[np.arange(len(points))[:, None], (points.argmin(axis=1)[:, None] + np.arange(3)) % 3]
     kept = np.sort(np.unique(points, axis=0, return_index=True)[1])
     kept = kept[~degenerate[kept]]
@@ -177,7 +176,7 @@ def _surface(mesh: trimesh.Trimesh, faces: NDArray[np.int64], twins: NDArray[np.
 def _mapping(mesh: trimesh.Trimesh, corners: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64] | None]:
     """The texture coordinates `[3T, 2]` of corners and how the texture wraps.
 
-    They are 0 in triangles with one that is no proper number, of which each renderer would make something else.
+    They are 0 in triangles with an invalid coordinate, which the renderers would draw differently.
     """
     coordinates = np.asarray(mesh.visual.uv, np.float32)[corners]  # type: ignore
     proper = (np.abs(coordinates) < FARTHEST).reshape(-1, 6).all(axis=1)
@@ -186,7 +185,7 @@ def _mapping(mesh: trimesh.Trimesh, corners: NDArray[np.int64]) -> tuple[NDArray
     for axis in np.flatnonzero(wrap == MIRROR):
         lowest, highest = coordinates[:, axis].min(), coordinates[:, axis].max()
         period = np.floor(lowest)
-        if highest <= period + 1:  # it is mirrored nowhere on this surface
+        if highest <= period + 1:  # not mirrored on this surface
             inside = coordinates[:, axis] - period
             coordinates[:, axis] = 1 - inside if period % 2 else inside
             wrap[axis] = REPEAT
@@ -194,13 +193,13 @@ def _mapping(mesh: trimesh.Trimesh, corners: NDArray[np.int64]) -> tuple[NDArray
 
 
 def _weld(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices `[n]` that are equal for the points `[n, 3]` that coincide."""
+    """Indices `[n]` of the points `[n, 3]`, equal for coinciding points."""
     scale = 1e-6 * max(float(np.ptp(points, axis=0).max()), np.finfo(float).tiny)
     return np.unique(np.round(points / scale).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _twins(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each of distinct triangles `[T, 3]` the index of the one with the same points in the other order, or -1."""
+    """For each of distinct triangles `[T, 3]`, the index of the one with the same points in reverse order, or -1."""
     turned = triangles[:, [0, 2, 1]]
     group = np.unique(np.concatenate([triangles, turned]), axis=0, return_inverse=True)[1].reshape(-1)
     owner = np.full(group.max() + 1, -1)
@@ -209,9 +208,9 @@ def _twins(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _corner_normals(triangles: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Unit normals `[3T, 3]` of the corners of `[T, 3, 3]`: the area-weighted mean over the faces around the corner's
-    point whose own normals lie within the crease angle of the corner's face."""
-    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])  # normals times 2 area
+    """Unit normals `[3T, 3]` of the corners of `[T, 3, 3]`: the area-weighted mean over the adjacent faces whose
+    normals lie within the crease angle of the corner's face."""
+    areas = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])  # 2 area * unit normal
     units = trimesh.util.unitize(areas)
     points = _weld(triangles.reshape(-1, 3))
     face_of_corner = np.repeat(np.arange(len(triangles)), 3)
@@ -229,7 +228,7 @@ def _has_colour(mesh: trimesh.Trimesh) -> bool:
 
 
 def _image(mesh: trimesh.Trimesh) -> Image.Image | None:
-    """The image that colours the mesh, where it has texture coordinates as well."""
+    """The image that colours the mesh, if the mesh also has texture coordinates."""
     if not isinstance(mesh.visual, TextureVisuals) or mesh.visual.uv is None:
         return None
     match mesh.visual.material:
@@ -239,7 +238,7 @@ def _image(mesh: trimesh.Trimesh) -> Image.Image | None:
 
 
 def _factor(mesh: trimesh.Trimesh) -> NDArray[np.floating] | None:
-    """The one linear colour `[3]` that the material gives, where the file has one and does not colour the vertices."""
+    """The linear colour `[3]` of the material, if the file gives one and does not colour the vertices."""
     match mesh.visual.material if isinstance(mesh.visual, TextureVisuals) else None:
         case PBRMaterial(baseColorFactor=factor) if factor is not None:
             return np.asarray(factor, float)[:3] / 255  # glTF: linear
@@ -251,7 +250,7 @@ def _factor(mesh: trimesh.Trimesh) -> NDArray[np.floating] | None:
 
 
 def _encoded_colours(mesh: trimesh.Trimesh) -> tuple[str, NDArray[np.uint8]] | None:
-    """What the file colours, "vertex" or "face", and the colours `[V or F, 3 or 4]` in sRGB."""
+    """Which elements the file colours, "vertex" or "face", and the colours `[V or F, 3 or 4]` in sRGB."""
     if isinstance(mesh.visual, ColorVisuals):
         kind = mesh.visual.kind
         return None if kind is None else (kind, getattr(mesh.visual, f"{kind}_colors"))
@@ -262,8 +261,8 @@ def _encoded_colours(mesh: trimesh.Trimesh) -> tuple[str, NDArray[np.uint8]] | N
 
 
 def _corner_colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[np.float32] | None:
-    """Linear colours `[3T, 3]` from vertex or face colours, which files but glTF's store in sRGB; a texture of another
-    format than glTF shows without them."""
+    """Linear colours `[3T, 3]` from vertex or face colours, which formats other than glTF store in sRGB; in these, a
+    texture overrides them."""
     corners = mesh.faces[faces].reshape(-1)
     if LINEAR_COLOUR in mesh.vertex_attributes:
         linear = np.asarray(mesh.vertex_attributes[LINEAR_COLOUR], np.float32)
@@ -277,14 +276,14 @@ def _corner_colours(mesh: trimesh.Trimesh, faces: NDArray[np.int64]) -> NDArray[
 
 
 def _texture(image: Image.Image) -> NDArray[np.uint8]:
-    """The image as RGB with sides that are powers of two, so that mip levels halve exactly in every renderer."""
+    """Convert the image to RGB with power-of-two sides, so that mip levels halve exactly in every renderer."""
     size = tuple(min(LARGEST_TEXTURE, 2 ** round(np.log2(side))) for side in image.size)
     colour = eight_bit(image).convert("RGB")
     return np.asarray(colour if colour.size == size else colour.resize(size, Image.Resampling.LANCZOS))
 
 
 def srgb_to_linear(encoded: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1).
+    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1).
 
     >>> srgb_to_linear(np.array([0.0, 0.5, 1.0])).round(4).tolist()
     [0.0, 0.214, 1.0]

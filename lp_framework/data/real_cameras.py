@@ -1,14 +1,14 @@
-"""Cameras of photographs, and how each becomes a spherical pose with the priors' field of view.
+"""Cameras of photographs, and their conversion to spherical poses with the priors' field of view.
 
 A photograph's camera is a camera-to-world matrix `[..., 4, 4]` (OpenGL axes, see `geometry.spherical`) in the object's
 frame (centre of its bounding box at the origin, +Y up, longest side 1), with intrinsics `[..., 3, 3]` in pixels, the
-corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). docs/data.md says how it becomes spherical: a
-turn about its own centre and a crop, both by one homography, in which the object's centre plane looks as large as to a
-camera of the priors' field of view at the *effective radius*.
+corner of the image at (0, 0) and its first pixel's centre at (0.5, 0.5). docs/data.md explains the conversion: one
+homography turns the camera about its own centre and crops the image so that the plane through the object's centre looks
+as large as to a camera with the priors' field of view at the *effective radius*.
 
-Where there is no model of the object, up is the direction to which the cameras' right axes are closest to
-perpendicular: photographers hold cameras level. Its silhouettes or its point cloud tell its centre and longest side.
-Among many cameras a few may be wrong: `fitting_views` and `agreeing_views` tell which.
+Without a model of the object, up is the direction most nearly perpendicular to the cameras' right axes, because
+photographers hold cameras level; its silhouettes or point cloud give its centre and longest side. A few of many cameras
+may be wrong: `fitting_views` and `agreeing_views` identify the consistent ones.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from torch import Tensor
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
 from lp_framework.geometry import camera_to_world, geodesic_angle, inverse, rigid_transform, view_pose
 
-NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; their middle is what an object's median becomes
-STRAY = 0.01  # share of a cloud's points beyond either side of its box: reconstructions have stray points
-POINTS = 20_000  # of a cloud that its box is taken from
-PROJECTED = 2_000  # of a cloud that its box in a photograph is taken from
-LEAST_OVERLAP = 0.5  # of the boxes of a silhouette and a cloud in a photograph: intersection over union
-CANDIDATES = 2_000  # pairs of views whose lines of sight propose an object's centre
-FARTHEST_APART = 0.25  # of a silhouette's longest side, from its middle to where the centre is seen
-MOST_LARGER = 3.0  # times, of a silhouette's length at the centre's distance, against the median one
-LEVEL = math.sin(math.radians(5))  # of a right axis along up; a camera that is less level weighs less
+NEAREST_RADIUS, FARTHEST_RADIUS = 1.2, 2.0  # of rendered views; an object's median is mapped to their middle
+STRAY = 0.01  # fraction of a cloud's points excluded on each side of its box: reconstructions have outliers
+POINTS = 20_000  # of a cloud, used to compute its box
+PROJECTED = 2_000  # of a cloud, used to compute its box in a photograph
+LEAST_OVERLAP = 0.5  # intersection over union of the boxes of a silhouette and a cloud in a photograph
+CANDIDATES = 2_000  # pairs of views whose lines of sight propose the object's centre
+FARTHEST_APART = 0.25  # between a silhouette's middle and the projected centre, in longest sides of the silhouette
+MOST_LARGER = 3.0  # largest ratio of a silhouette's length at the centre's distance to the median
+LEVEL = math.sin(math.radians(5))  # component of a right axis along up; less level cameras have less weight
 
 
 def from_pytorch3d(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Camera to world `[..., 4, 4]` with OpenGL axes of PyTorch3D's `R` `[..., 3, 3]` and `T` `[..., 3]`.
+    """Convert PyTorch3D's `R` `[..., 3, 3]` and `T` `[..., 3]` to camera to world `[..., 4, 4]` with OpenGL axes.
 
-    Theirs act on row vectors, X_camera = X_world R + T, with x left, y up and z forward.
+    They act on row vectors, X_camera = X_world R + T, with x left, y up and z forward.
 
     >>> from_pytorch3d(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))[:3, 3]
     tensor([-0., -0., -2.])
@@ -47,10 +47,10 @@ def from_pytorch3d(rotation: Tensor, translation: Tensor) -> Tensor:
 
 
 def ndc_intrinsics(focal_length: Tensor, principal_point: Tensor, size: tuple[int, int], isotropic: bool) -> Tensor:
-    """Intrinsics `[..., 3, 3]` in pixels of PyTorch3D's, `[..., 2]` each, for images of `size` (width, height).
+    """Convert PyTorch3D's intrinsics `[..., 2]` to `[..., 3, 3]` in pixels, for images of `size` (width, height).
 
-    In its coordinates x points left and y up from the middle of the image; where `isotropic` half the shorter side is
-    1 (PyTorch3D 0.5 and later), else half the width and half the height are 1 each.
+    Its coordinates start at the image centre, x left and y up. If `isotropic`, half the shorter side is 1 (PyTorch3D
+    0.5 and later), else half the width and half the height are 1 each.
 
     >>> ndc_intrinsics(torch.tensor([2.0, 2.0]), torch.tensor([0.0, 0.1]), (200, 100), isotropic=True)
     tensor([[100.,   0., 100.],
@@ -69,9 +69,9 @@ def _intrinsics(focal: Tensor, centre: Tensor) -> Tensor:
 
 
 def z_up_to_y_up(camera: Tensor) -> Tensor:
-    """A camera `[..., 4, 4]` of a world with +Z up in ours: x, y, z become Z, X, Y.
+    """Convert a camera `[..., 4, 4]` from a world with +Z up to ours: x, y, z become Z, X, Y.
 
-    So the longitude that grows from +X towards +Y there is our longitude.
+    A longitude that increases from +X towards +Y there equals ours.
 
     >>> z_up_to_y_up(rigid_transform(torch.eye(3), torch.tensor([1.0, 2.0, 3.0])))[:3, 3]
     tensor([2., 3., 1.])
@@ -80,17 +80,17 @@ def z_up_to_y_up(camera: Tensor) -> Tensor:
 
 
 def turn_towards_centre(camera: Tensor) -> tuple[Tensor, Tensor]:
-    """The camera `[..., 4, 4]` turned about its own centre until it is spherical, and the angle `[...]` of that turn
-    in degrees, the roll included."""
+    """Turn a camera `[..., 4, 4]` about its own centre until it is spherical; also returns the angle `[...]` of the
+    turn in degrees, including the roll."""
     turned = camera_to_world(view_pose(camera))
     return turned, torch.rad2deg(geodesic_angle(camera[..., :3, :3], turned[..., :3, :3]))
 
 
 def effective_radii(distances: Tensor) -> Tensor:
-    """The radii `[V]` that an object's views get, of their cameras' distances `[V]` in units of its longest side.
+    """The radii `[V]` of an object's views from their cameras' distances `[V]` in units of its longest side.
 
-    One factor for the object, which takes the median distance to the middle of the range of rendered views: so the
-    ratio of two radii is that of the distances. A view that would leave the range gets the range's end.
+    One factor per object maps the median distance to the middle of the range of rendered views, which preserves ratios
+    of distances. Radii outside the range are clipped.
 
     >>> effective_radii(torch.tensor([6.0, 8.0, 9.0, 20.0, 4.0]))
     tensor([1.2000, 1.6000, 1.8000, 2.0000, 1.2000])
@@ -100,7 +100,7 @@ def effective_radii(distances: Tensor) -> Tensor:
 
 
 def crop_field_of_view(distance: Tensor, radius: Tensor) -> Tensor:
-    """Field of view `[...]` in radians of the crop from `distance` that stands for a camera at the effective `radius`.
+    """Field of view `[...]` in radians of the crop from `distance` that represents a camera at the effective `radius`.
 
     >>> torch.rad2deg(crop_field_of_view(torch.tensor([1.6, 8.0]), torch.tensor([1.6, 1.6])))
     tensor([49.1000, 10.4397])
@@ -109,7 +109,7 @@ def crop_field_of_view(distance: Tensor, radius: Tensor) -> Tensor:
 
 
 def crop_homography(camera: Tensor, intrinsics: Tensor, radius: Tensor, size: int) -> Tensor:
-    """Homography `[..., 3, 3]` that takes points of the crop, in pixels of `size` a side, to those of the photograph of
+    """Homography `[..., 3, 3]` from points of the crop, in pixels of `size` a side, to those of the photograph with
     this `camera` `[..., 4, 4]` and `intrinsics` `[..., 3, 3]`; `radius` `[...]` is the effective one."""
     turned, _ = turn_towards_centre(camera)
     half = torch.tan(crop_field_of_view(camera[..., :3, 3].norm(dim=-1), radius) / 2)
@@ -123,7 +123,7 @@ def crop_homography(camera: Tensor, intrinsics: Tensor, radius: Tensor, size: in
 
 
 def spherical_camera(camera: Tensor, radius: Tensor) -> Tensor:
-    """The camera `[..., 4, 4]` that the crop stands for: spherical, where the real one is but at `radius` `[...]`."""
+    """The spherical camera `[..., 4, 4]` that the crop represents, at `radius` `[...]` in the same direction."""
     pose = view_pose(camera)
     return camera_to_world(torch.cat([pose[..., :2], radius[..., None]], dim=-1))
 
@@ -136,8 +136,8 @@ def project(camera: Tensor, intrinsics: Tensor, points: Tensor) -> Tensor:
 
 
 def perspective_residual(camera: Tensor, radius: Tensor, points: Tensor) -> Tensor:
-    """How far points `[P, 3]` of the object lie in the crop from where the spherical camera that it stands for has
-    them: root mean square `[...]`, in units of the image's side; infinite where its camera is among them."""
+    """Root mean square distance `[...]`, in units of the image's side, between points `[P, 3]` of the object in the
+    crop and in the image of the spherical camera it represents; infinite if that camera is among the points."""
     turned, _ = turn_towards_centre(camera)
     distance = camera[..., :3, 3].norm(dim=-1)
     crop, virtual = (
@@ -154,8 +154,8 @@ def _unit_intrinsics(field_of_view: Tensor) -> Tensor:
 
 
 class ObjectFrame(NamedTuple):
-    """Where an object is in the world: rows `[3, 3]` of its axes (second: up), centre `[3]` and longest side, and the
-    `sides` `[3]` of its bounding box in units of the longest."""
+    """The pose of an object in the world: rows `[3, 3]` of its axes (second: up), centre `[3]` and longest side, and
+    the `sides` `[3]` of its bounding box in units of the longest."""
 
     axes: Tensor
     centre: Tensor
@@ -163,7 +163,7 @@ class ObjectFrame(NamedTuple):
     sides: Tensor
 
     def camera(self, camera: Tensor) -> Tensor:
-        """A camera `[..., 4, 4]` of the world in the object's frame."""
+        """Transform a camera `[..., 4, 4]` from the world to the object's frame."""
         place = (self.axes @ (camera[..., :3, 3] - self.centre)[..., None]).squeeze(-1) / self.longest_side
         return rigid_transform(self.axes @ camera[..., :3, :3], place)
 
@@ -173,7 +173,7 @@ class ObjectFrame(NamedTuple):
 
 
 def fitting_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.float64]], points: Tensor) -> Tensor:
-    """Which views `[V]` (bool) have the points `[P, 3]` on an object's surface where its silhouette is; the other
+    """Which views `[V]` (bool) have a silhouette that matches the points `[P, 3]` on the object's surface; the other
     arguments are those of `frame_of_silhouettes`."""
     points = _some(points, PROJECTED)
     stray = torch.tensor([STRAY, 1 - STRAY]).to(points)
@@ -182,15 +182,15 @@ def fitting_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.f
     common = torch.minimum(cloud[:, 1], shown[:, 1]) - torch.maximum(cloud[:, 0], shown[:, 0])
     intersection = common.clamp(min=0).prod(dim=-1)
     areas = (cloud[:, 1] - cloud[:, 0]).prod(dim=-1) + (shown[:, 1] - shown[:, 0]).prod(dim=-1)
-    return intersection >= LEAST_OVERLAP * (areas - intersection)  # false where NaN: points behind the camera
+    return intersection >= LEAST_OVERLAP * (areas - intersection)  # false for NaN, from points behind the camera
 
 
 def agreeing_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.float64]]) -> Tensor:
-    """Which views `[V]` (bool) have one point near the middle of their silhouettes, and see these about equally long;
-    the arguments are those of `frame_of_silhouettes`.
+    """Which views `[V]` (bool) agree on one point near the middle of their silhouettes and on the object's approximate
+    length; the arguments are those of `frame_of_silhouettes`.
 
-    Each pair of lines of sight through the middles proposes the point nearest to both; taken is the one that most views
-    agree on.
+    Each pair of lines of sight through the middles proposes the point nearest to both; the one that most views agree on
+    is used.
     """
     boxes = _boxes(pixels)
     middles, lengths = boxes.mean(dim=1), (boxes[:, 1] - boxes[:, 0]).amax(dim=-1)
@@ -207,12 +207,12 @@ def agreeing_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.
 
 
 def _boxes(pixels: list[NDArray[np.float64]]) -> Tensor:
-    """Least and largest pixels `[V, 2, 2]` of silhouettes."""
+    """Minimum and maximum pixels `[V, 2, 2]` of silhouettes."""
     return torch.from_numpy(np.stack([np.stack([each.min(axis=0), each.max(axis=0)]) for each in pixels]))
 
 
 def _some(rows: Tensor, count: int) -> Tensor:
-    """At most `count` rows, evenly from first to last."""
+    """At most `count` evenly spaced rows, from first to last."""
     return rows[torch.linspace(0, len(rows) - 1, min(len(rows), count)).round().long()]
 
 
@@ -221,15 +221,15 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
     outline of its silhouette in each photograph.
 
     The centre is the point nearest to the lines of sight through the middles of the silhouettes. The height is the
-    median of the silhouettes' heights, both widths are nearly the largest of theirs (a 90 % quantile), all at the
-    centre's distance. Raises `ValueError` where the cameras do not go round the object.
+    median of the silhouettes' heights, both widths are their near-maximum width (90 % quantile), all at the centre's
+    distance. Raises `ValueError` if the cameras do not go around the object.
     """
     axes = _axes(cameras)
     outlines = map(torch.from_numpy, pixels)
     rays = [_rays(*each) for each in zip(axes @ cameras[:, :3, :3], intrinsics, outlines, strict=True)]
     places = cameras[:, :3, 3] @ axes.mT
     centre = _nearest_point(places, torch.stack([ray.mean(dim=0) for ray in rays]))
-    for _ in range(3):  # the middle of a silhouette is that of a view towards the centre
+    for _ in range(3):  # the middle of a silhouette is defined in a view towards the centre
         turned = camera_to_world(view_pose(rigid_transform(torch.eye(3).to(axes), places - centre)))[:, :3, :3]
         seen = [ray @ turn for ray, turn in zip(rays, turned, strict=True)]
         tangents = [each[:, :2] / -each[:, 2:] for each in seen]
@@ -247,8 +247,8 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
 def frame_of_points(cameras: Tensor, points: Tensor) -> ObjectFrame:
     """The frame of an object from cameras `[V, 4, 4]` around it and points `[P, 3]` on its surface.
 
-    Its box stands upright, is turned to where it covers the least ground, and leaves out `STRAY` of the points on
-    each side. Raises `ValueError` where the cameras do not go round the object and where the points have no extent.
+    Its box is upright, has the orientation with the smallest ground area, and excludes `STRAY` of the points on each
+    side. Raises `ValueError` if the cameras do not go around the object or the points have no extent.
     """
     axes = _axes(cameras)
     points = _some(points, POINTS)
@@ -263,7 +263,7 @@ def frame_of_points(cameras: Tensor, points: Tensor) -> ObjectFrame:
 
 
 def _axes(cameras: Tensor) -> Tensor:
-    """Rows `[3, 3]` of axes of the world the second of which is up; the horizontal ones are any."""
+    """Rows `[3, 3]` of axes of the world, the second of which is up; the horizontal ones are arbitrary."""
     right, up = cameras[:, :3, 0], cameras[:, :3, 1]
     weights = torch.ones_like(right[:, :1])
     for _ in range(10):  # least squares for nearly level cameras, least absolute values for others
@@ -292,7 +292,7 @@ def _rays(rotation: Tensor, intrinsics: Tensor, pixels: Tensor) -> Tensor:
 
 def _nearest_point(places: Tensor, directions: Tensor) -> Tensor:
     """The point `[..., 3]` with the least sum of squared distances from lines through `[..., V, 3]` along
-    `[..., V, 3]`; one of them where there are many."""
+    `[..., V, 3]`; any of them if it is not unique."""
     unit = torch.nn.functional.normalize(directions, dim=-1)
     across = torch.eye(3, dtype=unit.dtype) - unit[..., :, None] * unit[..., None, :]
     sums = across.sum(dim=-3), (across @ places[..., None]).sum(dim=-3)
