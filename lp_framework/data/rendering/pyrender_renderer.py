@@ -1,7 +1,7 @@
-"""`renderer=pyrender`: OpenGL without a display, by EGL or OSMesa; and `renderer=auto`, which falls back on raycast.
+"""`renderer=pyrender`: offscreen OpenGL by EGL or OSMesa; and `renderer=auto`, which falls back to raycast.
 
-pyrender's shader decodes textures from sRGB and multiplies vertex colours, taken as linear, onto the lit result. With
-metalness 0 and roughness 1 its material comes to a Lambertian surface with a faint sheen.
+pyrender's shader decodes textures from sRGB and multiplies the lit result by vertex colours, assumed to be linear. With
+metalness 0 and roughness 1 its material is a Lambertian surface with a faint sheen.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NEAR, FAR = 0.01, 100.0  # scene units
 
 @register("renderer", "pyrender")
 class PyrenderRenderer(Renderer):
-    """OpenGL without a display (EGL, else OSMesa), in software or on a GPU."""
+    """Offscreen OpenGL (EGL, else OSMesa), in software or on a GPU."""
 
     name = "pyrender"
 
@@ -48,7 +48,7 @@ class PyrenderRenderer(Renderer):
         camera_node = stage.add(camera)
         for towards, intensity in LIGHTS:
             source = pyrender.DirectionalLight(color=[1.0, 1.0, 1.0], intensity=intensity)
-            pose = trimesh.geometry.align_vectors([0, 0, 1], towards)  # its +Z points towards the light
+            pose = trimesh.geometry.align_vectors([0, 0, 1], towards)  # its +Z axis points towards the light
             stage.add(source, pose=pose, parent_node=camera_node)
         for pose in np.asarray(camera_to_world, dtype=np.float64):
             stage.set_pose(camera_node, pose)
@@ -57,8 +57,8 @@ class PyrenderRenderer(Renderer):
 
 
 def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
-    """Every triangle twice, the second time turned over with its normals, unless another one backs it; culling then
-    leaves the side in view."""
+    """Draw each triangle twice, once flipped with its normals, unless another triangle backs it; culling then leaves
+    the visible side."""
     import pyrender
 
     primitives = []
@@ -80,7 +80,7 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
                 continue
             attributes = [surface.positions[order], sign * surface.normals[order]]
             attributes += [each[order] for each in (coordinates, colours) if each is not None]
-            shared, index = np.unique(np.hstack(attributes), axis=0, return_inverse=True)  # OpenGL transforms each once
+            shared, index = np.unique(np.hstack(attributes), axis=0, return_inverse=True)  # so each is transformed once
             primitives.append(
                 pyrender.Primitive(
                     positions=shared[:, :3],
@@ -96,14 +96,14 @@ def _primitives(parts: list[Surface]) -> list[pyrender.Primitive]:
 
 @cache
 def offscreen_context() -> pyrender.OffscreenRenderer:
-    """The process's one OpenGL context, as closing any of pyrender's closes them all; `UserError` without OpenGL."""
+    """The process's only OpenGL context, as closing one of pyrender's closes them all; `UserError` without OpenGL."""
     chosen = os.environ.get("PYOPENGL_PLATFORM")
     reasons = []
     for platform in (chosen,) if chosen else PLATFORMS:
         os.environ["PYOPENGL_PLATFORM"] = platform
         try:
             return _open_context()
-        except Exception as error:  # missing library, no device, no driver: each fails in its own way
+        except Exception as error:  # missing library, device or driver: each raises its own exception
             reasons.append(f"{platform}: {type(error).__name__}: {error}")
             _forget_opengl()
     if not chosen:
@@ -115,8 +115,8 @@ def offscreen_context() -> pyrender.OffscreenRenderer:
 
 
 def _open_context() -> pyrender.OffscreenRenderer:
-    """A context without pyrender's own multisampling: we supersample by ourselves, as raycast does, which leaves each
-    sample either opaque or clear; both would take software OpenGL three times as long."""
+    """A context without pyrender's multisampling: like raycast we supersample ourselves, which leaves each sample
+    either opaque or transparent; doing both would make software OpenGL three times slower."""
     import pyrender
 
     allocate = pyrender.renderer.glRenderbufferStorageMultisample
@@ -125,17 +125,17 @@ def _open_context() -> pyrender.OffscreenRenderer:
 
 
 def _forget_opengl() -> None:
-    """PyOpenGL binds to a platform when it is first imported: import it afresh, so that the next one has a chance."""
+    """Unload PyOpenGL, which binds to a platform on first import, so that the next platform can be tried."""
     for module in [name for name in sys.modules if name.partition(".")[0] in ("OpenGL", "pyrender")]:
         del sys.modules[module]
 
 
 @register("renderer", "auto")
 class AutoRenderer(Renderer):
-    """pyrender where there is OpenGL, else raycast with a warning that says why."""
+    """Use pyrender if OpenGL is available, else raycast with a warning that says why."""
 
     def __new__(cls) -> Renderer:  # type: ignore[misc]  # one of the two
-        """A renderer by either."""
+        """Create one of the two renderers."""
         try:
             offscreen_context()
         except UserError as error:

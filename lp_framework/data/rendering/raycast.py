@@ -1,7 +1,7 @@
-"""`renderer=raycast`: rays against triangles on the CPU, without OpenGL, with the look of `renderer=pyrender`.
+"""`renderer=raycast`: CPU ray casting without OpenGL, with the look of `renderer=pyrender`.
 
-Embree says which triangle each ray meets; the rest is arithmetic: pyrender's shading formula for metalness 0 and
-roughness 1, and OpenGL's trilinear texture filter.
+Embree finds the triangle that each ray hits. Shading is pyrender's formula for metalness 0 and roughness 1, and
+textures use OpenGL's trilinear filter.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lp_framework.data.rendering.renderer import AMBIENT, LIGHTS, SUPERSAMPLING,
 from lp_framework.errors import optional_import
 from lp_framework.registry import register
 
-RAYS_AT_ONCE = 2**18  # bounds the memory
+RAYS_AT_ONCE = 2**18  # limits memory use
 
 
 @register("renderer", "raycast")
@@ -39,14 +39,14 @@ class RaycastRenderer(Renderer):
         normals = np.concatenate([part.normal for part in parts])
         intersector = embree.RayMeshIntersector(mesh)
         side = resolution * SUPERSAMPLING
-        step = 2 * np.tan(np.radians(field_of_view_degrees) / 2) / side  # of a sample, on the image plane at depth 1
+        step = 2 * np.tan(np.radians(field_of_view_degrees) / 2) / side  # sample spacing on the image plane at depth 1
         for pose in np.asarray(camera_to_world, dtype=np.float64):
             samples, depth = np.zeros((side * side, 4), np.uint8), np.zeros(side * side, np.float32)
             for start in range(0, side * side, RAYS_AT_ONCE):
-                index = np.arange(start, min(start + RAYS_AT_ONCE, side * side))  # row by row, the first on top
+                index = np.arange(start, min(start + RAYS_AT_ONCE, side * side))  # row by row, from the top
                 row, column = np.divmod(index, side)
                 x, y = (column + 0.5 - side / 2) * step, (side / 2 - row - 0.5) * step
-                rays = x[:, None] * pose[:3, 0] + y[:, None] * pose[:3, 1] - pose[:3, 2]  # [n, 3], of depth 1
+                rays = x[:, None] * pose[:3, 0] + y[:, None] * pose[:3, 1] - pose[:3, 2]  # [n, 3], depth 1
                 triangle = intersector.intersects_first(np.broadcast_to(pose[:3, 3], rays.shape), rays)
                 seen_from_behind = (normals[triangle] * rays).sum(axis=1) > 0
                 swapped = (triangle >= 0) & seen_from_behind & (twins[triangle] >= 0)
@@ -61,7 +61,7 @@ class RaycastRenderer(Renderer):
 
 
 class _Part:
-    """A surface with what the shading of a hit needs, by triangle."""
+    """A surface with per-triangle data for shading hits."""
 
     def __init__(self, surface: Surface) -> None:
         self.surface = surface
@@ -77,14 +77,14 @@ class _Part:
     def seen(
         self, triangle: NDArray[np.int64], rays: NDArray[np.float64], pose: NDArray[np.float64], step: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Colours `[n, 3]` in [0, 1], sRGB, and depths `[n]` where rays from the camera meet triangles of this one."""
+        """Colours `[n, 3]` in [0, 1], sRGB, and depths `[n]` where camera rays hit triangles of this surface."""
         surface, normal = self.surface, self.normal[triangle]
         facing = (normal * rays).sum(axis=1)
         facing = np.where(np.abs(facing) < 1e-12, 1e-12, facing)
         depth = (normal * (self.origin[triangle] - pose[:3, 3])).sum(axis=1) / facing
         gradients = self.gradient1[triangle], self.gradient2[triangle]
         from_origin = pose[:3, 3] + depth[:, None] * rays - self.origin[triangle]
-        # Embree works in single precision: a ray that grazes an edge may come out just beside the triangle.
+        # Embree uses single precision: a ray close to an edge may hit just outside the triangle.
         weight1, weight2 = (np.clip((gradient * from_origin).sum(axis=1), 0, 1) for gradient in gradients)
         weights = np.stack([np.maximum(1 - weight1 - weight2, 0), weight1, weight2], axis=1).astype(np.float32)
         weights /= weights.sum(axis=1, keepdims=True)
@@ -98,7 +98,7 @@ class _Part:
         if self.mips is not None and surface.texture_coordinates is not None:
             corners = surface.texture_coordinates.reshape(-1, 3, 2)[triangle].astype(np.float64)
             sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-            footprint = []  # how far a step of one sample to the right or up goes on the texture
+            footprint = []  # movement on the texture per sample to the right or up
             for axis in (pose[:3, 0], pose[:3, 1]):
                 moved = (depth * step)[:, None] * (axis - rays * ((normal @ axis) / facing)[:, None])
                 footprint.append(
@@ -119,8 +119,8 @@ def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 def _shade(
     normal: NDArray[np.float32], view: NDArray[np.float32], colour: NDArray[np.float32], pose: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Light `[n, 3]` towards the camera, as `compute_brdf` in pyrender's mesh.frag has it for metalness 0 and roughness
-    1, at which the microfacet distribution D is 1 / pi and Smith's k is 1 / 2."""
+    """Light `[n, 3]` towards the camera: `compute_brdf` of pyrender's mesh.frag for metalness 0 and roughness 1, where
+    the microfacet distribution D is 1 / pi and Smith's k is 1 / 2."""
     reflectance = np.float32(0.04)
     nv = np.clip(np.abs((normal * view).sum(axis=1)), 0.001, 1)
     out = AMBIENT * colour
@@ -138,7 +138,7 @@ def _shade(
 
 
 class _Mips:
-    """A texture with its mip levels one after the other in one array of texels, as OpenGL's trilinear filter has it."""
+    """A texture and its mip levels, concatenated in one array of texels, for OpenGL's trilinear filter."""
 
     def __init__(self, texture: NDArray[np.uint8], wrap: NDArray[np.int64] | None) -> None:
         self.wrap = (REPEAT, REPEAT) if wrap is None else wrap  # across and up
@@ -153,8 +153,8 @@ class _Mips:
         self.offsets = np.cumsum(self.sizes.prod(axis=1)) - self.sizes.prod(axis=1)  # [levels], of the first texels
 
     def sample(self, coordinates: NDArray[np.float32], footprint: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Values `[n, 3]` in [0, 1] at coordinates `[n, 2]`; `footprint` `[n, 2, 2]` has their change from a sample to
-        the next, to the right and up."""
+        """Values `[n, 3]` in [0, 1] at coordinates `[n, 2]`; `footprint` `[n, 2, 2]` is their change to the next sample
+        to the right and up."""
         steps = np.linalg.norm(footprint * self.sizes[0], axis=2).max(axis=1)  # in texels
         level = np.clip(np.log2(np.maximum(steps, 1e-12)), 0, len(self.sizes) - 1)
         below = np.floor(level).astype(np.int64)
@@ -179,7 +179,7 @@ class _Mips:
 
 
 def _wrapped(index: NDArray[np.int64], side: NDArray[np.int64], wrap: int) -> NDArray[np.int64]:
-    """Indices of texels within a texture's `side` for those that may lie beyond."""
+    """Wrap indices of texels that may lie outside a texture's `side`."""
     if wrap == CLAMP:
         return index.clip(0, side - 1)
     if wrap == REPEAT:

@@ -1,7 +1,7 @@
-"""What every renderer keeps to: the interface, the light and the anti-aliasing.
+"""The renderer interface, with the lighting and anti-aliasing that all renderers share.
 
-The light is fixed to the camera, not to the object: were it fixed to the object, its shading would tell the longitude
-of a body of revolution, and the symmetry of an object would be no ambiguity any more.
+The lights are fixed to the camera. If they were fixed to the object, shading would reveal the longitude of a body of
+revolution, and a symmetric object would no longer be ambiguous.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-SUPERSAMPLING = 2  # samples a pixel along each side
-# Parallel lights: the vector towards one in the camera's frame (+X right, +Y up, +Z back), and its intensity.
-LIGHTS = ((-0.6, 0.8, 1.1), 2.5), ((1.0, 0.1, 0.7), 0.65)  # from the upper left behind; from the right
+SUPERSAMPLING = 2  # samples per pixel along each side
+# Parallel lights: direction towards the light in the camera's frame (+X right, +Y up, +Z back), and intensity.
+LIGHTS = ((-0.6, 0.8, 1.1), 2.5), ((1.0, 0.1, 0.7), 0.65)  # from behind the camera at the upper left; from the right
 AMBIENT = 0.2
 
 
 class View(NamedTuple):
     """A rendered view.
 
-    `pixels` `[H, W, 4]` (uint8) have straight alpha and are transparent where the scene is not. `depth` `[H, W]`
-    (float32), if the renderer provides it, is along the optical axis in scene units, 0 where a pixel is transparent.
+    `pixels` `[H, W, 4]` (uint8) have straight alpha and are transparent outside the scene. `depth` `[H, W]` (float32),
+    if the renderer provides it, is along the optical axis in scene units, 0 where a pixel is transparent.
     """
 
     pixels: NDArray[np.uint8]
@@ -32,7 +32,7 @@ class View(NamedTuple):
 
 
 class Renderer(ABC):
-    """Draws views of scenes. It is pickled to worker processes, so its state has to be picklable."""
+    """Draws views of scenes. It is pickled to worker processes, so its state must be picklable."""
 
     name: str
 
@@ -49,14 +49,14 @@ class Renderer(ABC):
     def render(
         self, scene: trimesh.Scene, camera_to_world: ArrayLike, resolution: int, field_of_view_degrees: float
     ) -> NDArray[np.uint8]:
-        """The pixels of all `views` at once, `[V, H, W, 4]`."""
+        """Pixels `[V, H, W, 4]` of all `views` at once."""
         views = self.views(scene, camera_to_world, resolution, field_of_view_degrees)
         return np.stack([view.pixels for view in views])
 
 
 def downsample(samples: NDArray[np.uint8], depth: NDArray[np.float32]) -> View:
-    """The view of samples `[H s, W s, 4]` with premultiplied alpha and depths `[H s, W s]`, s = SUPERSAMPLING: each
-    pixel's mean, so that no background bleeds into the edges, and the depth of its nearest sample."""
+    """Downsample pixels `[H s, W s, 4]` with premultiplied alpha and depths `[H s, W s]`, s = SUPERSAMPLING: the mean
+    colour of each pixel, without bleeding the background into edges, and the depth of its nearest sample."""
     steps = range(SUPERSAMPLING)
     parts = [(slice(row, None, SUPERSAMPLING), slice(column, None, SUPERSAMPLING)) for row in steps for column in steps]
     sums = np.add.reduce([samples[part] for part in parts], dtype=np.uint16)

@@ -1,7 +1,7 @@
-"""From objects to views on disk by the paper's protocol (appendix, Dataset Construction).
+"""Rendering objects to views on disk by the paper's protocol (appendix, Dataset Construction).
 
-The layout is that of `data.views`, with one `render.json` an object that says how it was rendered, and from
-which files.
+The layout is that of `data.views`, with one `render.json` per object that records how it was rendered and from which
+files.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ from lp_framework.errors import UserError, check_settings
 from lp_framework.geometry import camera_to_world
 
 RECORD = "render.json"
-# Settings that records leave out at these values, as older ones do.
+# Settings that records omit at these values, for compatibility with older records.
 LATER = {"train_views": None, "depth": False, "field_of_view_range": None}
 
 
 @dataclass(frozen=True)
 class ViewProtocol:
-    """Where the cameras stand: by default on 9 latitudes x 24 longitudes, 216 training views, as in the paper.
+    """Camera placement: by default 9 latitudes x 24 longitudes, 216 training views, as in the paper.
 
-    The training views lie on a grid of latitudes and longitudes (degrees, the latitudes with both ends), each at a
-    random radius (scene units); the test views are random in the same ranges, and so are the training views where
-    their number `train_views` is given. With `depth` the views' depths are kept as well. With `field_of_view_range`
-    (degrees) each object is seen with a field of view of its own, drawn from the range, from as much nearer or farther
-    that it looks as large as with `field_of_view_degrees`.
+    Training views lie on a grid of latitudes (both ends included) and longitudes (degrees), each at a random radius
+    (scene units). Test views are random in the same ranges; so are the training views if their number `train_views` is
+    given. With `depth`, depths are saved too. With `field_of_view_range` (degrees), each object has its own field of
+    view, drawn from the range; the distance is scaled so that the object appears as large as with
+    `field_of_view_degrees`.
     """
 
     resolution: int = 512
@@ -80,7 +80,7 @@ class ViewProtocol:
         )  # fmt: skip
 
     def of_object(self, name: str) -> ViewProtocol:
-        """The protocol of one object, whose field of view is a number."""
+        """The protocol of one object, with a fixed field of view."""
         if self.field_of_view_range is None:
             return self
         low, high = self.field_of_view_range
@@ -92,9 +92,9 @@ class ViewProtocol:
         )
 
     def training_poses(self, object_name: str) -> NDArray[np.float64]:
-        """View poses `[V, 3]` (radians, radians, scene units), on the grid latitude by latitude.
+        """View poses `[V, 3]` (radians, radians, scene units); on the grid, ordered by latitude.
 
-        What is random in them depends on the seed and the object's name alone, not on which other objects there are.
+        Random values depend only on the seed and the object's name, not on the other objects.
         """
         if self.train_views is not None:
             return self._random_poses(object_name, "train", self.train_views)
@@ -106,7 +106,7 @@ class ViewProtocol:
         return np.stack([latitude.reshape(-1), longitude.reshape(-1), radius], axis=1)
 
     def test_poses(self, object_name: str) -> NDArray[np.float64]:
-        """View poses `[V, 3]` (radians, radians, scene units), uniform in the ranges; keyed like `training_poses`."""
+        """View poses `[V, 3]` (radians, radians, scene units), uniform in the ranges; seeded like `training_poses`."""
         return self._random_poses(object_name, "test", self.test_views)
 
     def _random_poses(self, object_name: str, split: str, count: int) -> NDArray[np.float64]:
@@ -119,7 +119,7 @@ class ViewProtocol:
 
 
 def _steps(start: float, end: float, step: float) -> NDArray[np.floating]:
-    """`start`, `start + step`, ... up to `end`, which is among them when the step divides the range."""
+    """`start`, `start + step`, ... up to `end`, which is included if the step divides the range."""
     return start + step * np.arange(math.floor((end - start) / step + 1e-9) + 1)
 
 
@@ -130,8 +130,8 @@ def render_object(
     renderer: Renderer,
     files: Mapping[str, str] | None = None,
 ) -> None:
-    """Render an object into `<root>/<name>`, whole or not at all, unless it is there already; `files` is the record of
-    its `Origin`. `UserError` when it does not load, when its folder holds something else, and when it cannot be
+    """Render an object into `<root>/<name>`, completely or not at all, unless it exists already; `files` is the record
+    of its `Origin`. Raises `UserError` if it does not load, or if its folder has other contents or cannot be
     written."""
     folder, scene = Path(root) / obj.name, obj.load()
     made_from = {"mesh": fingerprint(scene)} | ({} if files is None else {"files": files})
@@ -139,7 +139,7 @@ def render_object(
         changes, record = _changes(folder, protocol), read_record(folder / RECORD)
         if not changes and record.get("mesh") != made_from["mesh"]:
             changes = "of another mesh, or by an earlier version's reading of it"
-        if changes:  # told once where it is the same for several objects
+        if changes:  # reported once if it is the same for several objects
             advice = "choose another folder of views or delete them"
             raise UserError(f"the views in {root} were rendered differently ({changes}); {advice}")
         if record != record | made_from:  # the same mesh in other files
@@ -177,8 +177,8 @@ def render_object(
 
 
 def _changes(folder: Path, protocol: ViewProtocol) -> str:
-    """How an object's views differ from what is wanted (see `differences`). Labels may differ, they are not rendered;
-    depths that are there do no harm where they are not asked for."""
+    """Describe how an object's views differ from what is wanted (see `differences`). Labels are not rendered and may
+    differ; existing depths that were not requested are ignored."""
     record = read_record(folder / RECORD)
     if not isinstance(record.get("protocol"), dict):
         return f"it has no proper {RECORD}"
@@ -194,11 +194,11 @@ def render_objects(
     workers: int | None = None,
     check_meshes: bool = True,
 ) -> None:
-    """Render objects into `<root>/<name>`, in `workers` processes (None: one a CPU core); finished ones are skipped.
+    """Render objects into `<root>/<name>`, in `workers` processes (None: one per CPU core); finished ones are skipped.
 
-    `check_meshes` loads the meshes of finished ones too, to see that the views were made from them; without it those
-    are loaded whose files are not those that the views were made from. Two runs into one folder take turns. A
-    `UserError` of one object does not stop the others, unless the disk is full; one at the end lists them all.
+    `check_meshes` also loads the meshes of finished objects to verify that the views were made from them; without it,
+    only those with changed files are loaded. Runs that share a folder take turns. A `UserError` of one object does not
+    stop the others, unless the disk is full; an error at the end lists them all.
     """
     todo = [obj for obj in objects if check_meshes or not _is_finished(obj, Path(root) / obj.name, protocol)]
     if not todo:
@@ -210,13 +210,13 @@ def render_objects(
     with locked(Path(root), ".render.lock"):
         jobs = [(obj, obj.origin and obj.origin.record()) for obj in todo]
         done: DataLoader[tuple[UserError | None, list[str]]] = DataLoader(
-            jobs,  # type: ignore[arg-type]  # a list will do
+            jobs,  # type: ignore[arg-type]  # a list is enough
             batch_size=None,
             collate_fn=partial(_work, root=root, protocol=protocol, renderer=renderer),
             num_workers=workers if workers > 1 else 0,
             multiprocessing_context="spawn" if workers > 1 else None,  # an OpenGL context does not survive a fork
             worker_init_fn=_begin_worker,
-            generator=torch.Generator(),  # or a training that renders first would go on with other random numbers
+            generator=torch.Generator(),  # keeps the global random state unchanged for a training that renders first
         )
         try:
             for obj, (failure, messages) in zip(todo, tracked(done, "rendering", len(todo)), strict=True):
@@ -235,7 +235,7 @@ def render_objects(
 
 
 def _is_finished(obj: MeshObject, folder: Path, protocol: ViewProtocol) -> bool:
-    """Whether an object's views are there as wanted, and of its files where these are at hand."""
+    """Whether an object's views exist as wanted and, if its files are available, were made from these."""
     sound = not _changes(folder, protocol)
     return sound and (obj.origin is None or obj.origin.is_of(read_record(folder / RECORD).get("files")))
 
@@ -243,7 +243,7 @@ def _is_finished(obj: MeshObject, folder: Path, protocol: ViewProtocol) -> bool:
 def _work(
     job: tuple[MeshObject, dict[str, str] | None], root: str | Path, protocol: ViewProtocol, renderer: Renderer
 ) -> tuple[UserError | None, list[str]]:
-    """Render one object: its `UserError`, and its warnings."""
+    """Render one object; returns its `UserError`, if any, and its warnings."""
     failure = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
@@ -251,18 +251,18 @@ def _work(
             render_object(job[0], root, protocol, renderer, job[1])
         except UserError as error:
             failure = error
-    # Others than those for users, such as NumPy's of a division by zero, tell them nothing.
+    # Other categories, such as NumPy's division by zero, are of no use to users.
     return failure, [" ".join(str(each.message).split()) for each in caught if issubclass(each.category, UserWarning)]
 
 
 def _begin_worker(_: int) -> None:
-    # The workers fill the cores already; more threads in Mesa's software OpenGL would only get in each other's way.
+    # The workers use all cores already; more threads in Mesa's software OpenGL would only compete with them.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent is killed; left alone it would go on writing, into the next run's folder."""
+    """Exit when the parent is killed; otherwise this process would keep writing, into the next run's folder."""
     if parent := multiprocessing.parent_process():
         parent.join()
         os._exit(1)
