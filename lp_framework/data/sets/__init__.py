@@ -1,1 +1,1 @@
-"""Sources of views: meshes to render, and published data sets in their authors' own formats."""
+"""View sources: meshes to render, and published data sets in their original formats."""

@@ -7,8 +7,8 @@
     <path>/<category>/<sequence>/masks/frame000001.png    probability of the object, 0 to 255
     <path>/<category>/<sequence>/pointcloud.ply           the object alone; the challenge's test sequences have none
 
-Cameras are PyTorch3D's. Their world is COLMAP's, of any orientation, origin and scale, and there is no model of the
-object, so its frame is taken from cameras, masks and point cloud (see `real_cameras`).
+Cameras are PyTorch3D's, in COLMAP's world, which has arbitrary orientation, origin and scale. There is no model of the
+object, so its frame is estimated from cameras, masks and point cloud (see `real_cameras`).
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ from lp_framework.registry import register
 
 FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
 FORMATS = {"ndc_isotropic": True, "ndc_norm_image_bounds": False}
-SAMPLES = 4000  # pixels of a mask that its extent is taken from
-BLACK = 8  # an image that is nowhere brighter is one that was blackened for the challenge
+SAMPLES = 4000  # pixels of a mask used to measure its extent
+BLACK = 8  # images with no brighter pixel were blackened for the challenge
 
 
 @register("data", "co3d")
 class CO3DData(PhotographedData):
     """CO3Dv2's single-sequence subset: crops around the object of each scene, converted into `views` on first use.
 
-    `scenes` of the sequences in the set lists of `subsets` are drawn with `split_seed` and kept in `objects.json`; of
-    each, `train_views` + `test_views` frames are chosen for their viewpoints.
+    `scenes` sequences are drawn from the set lists of `subsets` with `split_seed` and stored in `objects.json`; of
+    each, `train_views` + `test_views` frames with well-spread viewpoints are chosen.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class CO3DData(PhotographedData):
         return {**super().demands(), "subsets": self.subsets}
 
     def names(self) -> list[str]:
-        """The scenes, `<category>-<sequence>`: those that are chosen, or drawn."""
+        """The chosen or drawn scenes, `<category>-<sequence>`."""
         if self.wanted is not None:
             return chosen(self._available(), self.wanted, self.download)
         how = {"subsets": self.subsets, "scenes": self.scenes, "split_seed": self.split_seed}
@@ -93,7 +93,7 @@ class CO3DData(PhotographedData):
         return names_below(self.download, scenes, "scenes of CO3Dv2", ", ".join(looked_for))
 
     def _listed(self, folder: Path) -> set[tuple[str, int]]:
-        """Sequence and frame number of every frame in the set lists that a category has; few have all."""
+        """Sequence and frame number of every frame in the category's set lists; few categories have all lists."""
         listed: set[tuple[str, int]] = set()
         for file in (folder / "set_lists" / f"set_lists_{subset}.json" for subset in self.subsets):
             if file.is_file():
@@ -123,14 +123,14 @@ class CO3DData(PhotographedData):
 
 
 def _of_sequence(file: Path, sequence: str) -> list[dict[str, Any]]:
-    """The entries of a file of annotations that are of a sequence."""
+    """The entries of an annotation file that belong to a sequence."""
     content = read_json(file)
     with expecting(f"{file}: must hold a list of frames or sequences, each with sequence_name"):
         return [each for each in content if each["sequence_name"] == sequence]
 
 
 def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
-    """A frame as annotated, its camera still in the world of its sequence."""
+    """An annotated frame, with its camera still in the sequence's world."""
     where = f"{file}: frame {frame['frame_number']} of sequence '{frame['sequence_name']}'"
     wanted = "R of 3 x 3 numbers, T of 3, focal_length and principal_point of 2"
     with expecting(f"{where} needs image, mask and viewpoint with {wanted}, intrinsics_format {' or '.join(FORMATS)}"):
@@ -145,8 +145,8 @@ def _photograph(frame: dict[str, Any], root: Path, file: Path) -> Photograph:
 
 
 def _cloud_and_scores(file: Path, sequence: str, root: Path) -> tuple[Path | None, dict[str, float | None]]:
-    """The point cloud of a sequence, None where there is none, and the scores of its cameras and cloud (the larger the
-    better; None where not on record)."""
+    """The point cloud of a sequence, None if missing, and the scores of its cameras and cloud (larger is better; None
+    if not recorded)."""
     found = _of_sequence(file, sequence)
     if not found:
         raise UserError(f"{file}: has no sequence '{sequence}', which the set list names")
@@ -182,7 +182,7 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
     if points is not None:
         sound = fitting_views(cameras, intrinsics, pixels, points)
         if 2 * sound.sum() <= len(whole):
-            points = None  # of something else
+            points = None  # it belongs to something else
     if points is None:
         sound = agreeing_views(cameras, intrinsics, pixels)
     if wrong := [photograph.file.name for photograph, fits in zip(whole, sound, strict=True) if not fits]:
@@ -201,7 +201,7 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
 
 
 def read_points(file: Path) -> Tensor:
-    """The points `[P, 3]` (float64) of a PLY file; `UserError` naming it where it does not load or has fewer than 3."""
+    """The points `[P, 3]` (float64) of a PLY file; `UserError` naming the file if it cannot be read or has under 3."""
     with expecting(f"{file}: does not load as a point cloud of three or more points"):
         loaded: Any = trimesh.load(file, process=False)
         if len(loaded.vertices) < 3:

@@ -1,10 +1,10 @@
-"""Photographs with cameras, converted once into views on disk; everything after that is as with rendered views.
+"""Photographs with cameras, converted once into views on disk and then used like rendered views.
 
-Crops around the object by `real_cameras`, chosen so that their viewpoints are spread evenly. `conversion.json` beside
-an object's views says what they were made from, by which files, and what was left out.
+They become crops around the object (see `real_cameras`) with evenly spread viewpoints. `conversion.json` beside an
+object's views records the settings, the source files, and what was left out.
 
-Beside what every `transform.json` has, a frame keeps its photograph (`source`, `width`, `height`), its camera
-(`photograph_camera`, in the object's frame, and `photograph_intrinsics`, pixels), the `turn_degrees` and
+In addition to the usual `transform.json` fields, a frame stores its photograph (`source`, `width`, `height`), its
+camera (`photograph_camera`, in the object's frame, and `photograph_intrinsics`, pixels), the `turn_degrees` and
 `crop_angle_degrees` of its crop, and its `perspective_residual`.
 """
 
@@ -39,14 +39,14 @@ from lp_framework.geometry import is_rotation, to_ifusion, view_pose
 from lp_framework.keyed_random import stable_id
 
 RECORD = "conversion.json"
-LARGEST_PERSPECTIVE = 0.25  # of the image's side; a view whose crop differs more from a spherical camera's is left out
-NEAREST = 1.0  # units of the object's longest side; a camera nearer than that is left out
+LARGEST_PERSPECTIVE = 0.25  # of the image's side; views whose crop differs more from a spherical camera's are left out
+NEAREST = 1.0  # units of the object's longest side; nearer cameras are left out
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph of an object: its file, its mask's, its camera `[4, 4]` (camera to world, OpenGL axes, float64) in
-    the object's frame (see `real_cameras`), its intrinsics `[3, 3]` in pixels and its size (width, height)."""
+    """A photograph of an object: its file, mask file, camera `[4, 4]` (camera to world, OpenGL axes, float64) in the
+    object's frame (see `real_cameras`), intrinsics `[3, 3]` in pixels and size (width, height)."""
 
     file: Path
     mask: Path
@@ -61,11 +61,11 @@ class Photograph:
             raise ValueError("its focal lengths must be positive")
 
     def colours(self) -> Image.Image:
-        """The photograph in RGB; `UserError` where it cannot be read and where its size is another."""
+        """The photograph in RGB; `UserError` if it cannot be read or has another size."""
         return self._of_size(self.file, read_image(self.file)).convert("RGB")
 
     def opacity(self) -> Image.Image:
-        """What its mask marks ("L"), all of it where that has no background; `UserError` as those of `colours`."""
+        """The opacity from its mask ("L"), opaque if the mask has no background; `UserError` as for `colours`."""
         mask = self._of_size(self.mask, read_mask(self.mask))
         return mask_opacity(mask, str(self.file)) or Image.new("L", self.size, 255)
 
@@ -77,8 +77,8 @@ class Photograph:
 
 
 class Annotated(NamedTuple):
-    """What a data set says of an object: photographs, `points` `[P, 3]` on its bounding box, how many photographs were
-    left out for which reason, and what else `conversion.json` is to keep."""
+    """A data set's information about an object: photographs, `points` `[P, 3]` on its bounding box, the number of
+    photographs left out for each reason, and further entries of `conversion.json`."""
 
     photographs: list[Photograph]
     points: Tensor
@@ -87,21 +87,21 @@ class Annotated(NamedTuple):
 
 
 class ConvertedSource(ViewSource):
-    """Views in `path` that are converted on first use from those of a download, whose folder is only read."""
+    """Views in `path`, converted on first use from those of a download, whose folder is never written to."""
 
     download: Path
 
     @abstractmethod
     def convert(self, name: str, folder: Path) -> tuple[list[Path], dict[str, Any]]:
-        """Write an object's views into a folder; the files that they are made from, and what its record is to keep
-        beside them and `demands`."""
+        """Write an object's views into a folder; returns the source files, and entries to record in addition to these
+        and `demands`."""
 
     def demands(self) -> dict[str, Any]:
-        """What of the settings decides an object's views, as plain values."""
+        """The settings that determine an object's views, as plain values."""
         return {"source": self.download.resolve().name}
 
     def prepare(self) -> None:
-        """Convert what is missing, object by object; one `UserError` at the end lists those that could not be."""
+        """Convert missing objects one by one; one `UserError` at the end lists those that failed."""
         failures: dict[str, str] = {}
         with locked(self.path, ".convert.lock"):
             objects = self.names()
@@ -129,26 +129,26 @@ class ConvertedSource(ViewSource):
 
 
 def is_converted(folder: Path, demands: Mapping[str, Any], download: Path) -> bool:
-    """Whether a folder holds an object's views that were made as its record, and `demands`, say, and from the files
-    that are in the download, where it is at hand and the record names them."""
+    """Whether a folder holds an object's views that match `demands` and, if the download is available and the record
+    names them, were made from its current files."""
     record = read_record(folder / RECORD)
     names = record.get("files")
     if not record or differences(record, demands):
         return False
-    if not isinstance(names, list) or not download.is_dir():  # of an earlier version, or nothing to compare with
+    if not isinstance(names, list) or not download.is_dir():  # an older record, or nothing to compare with
         return True
     files = [download / str(name) for name in names]
     return all(map(os.path.isfile, files)) and Origin(files).is_of(record.get("origin"))
 
 
 def frame(file: str, camera: Tensor) -> dict[str, Any]:
-    """What a `transform.json` says of a view: its file and its camera `[4, 4]`."""
+    """The `transform.json` entry of a view with an image file and a camera `[4, 4]`."""
     latlon = to_ifusion(view_pose(camera)).tolist()
     return {"file_path": file, "transform_matrix": camera.tolist(), "latlon": latlon}
 
 
 class PhotographedData(ConvertedSource):
-    """Object-centric crops of photographs with cameras: so many views of each object, chosen with `split_seed`."""
+    """Object-centric crops of photographs with cameras: a number of views per object, chosen with `split_seed`."""
 
     def __init__(
         self,
@@ -172,11 +172,11 @@ class PhotographedData(ConvertedSource):
 
     @abstractmethod
     def photographs(self, name: str) -> Annotated:
-        """An object's photographs and its extent, in the object's frame."""
+        """The photographs and extent of an object, in the object's frame."""
 
     @abstractmethod
     def annotations(self, name: str) -> list[Path]:
-        """The files that say what `photographs` knows of an object."""
+        """The annotation files that `photographs` uses for an object."""
 
     def demands(self) -> dict[str, Any]:
         names = ("train_views", "test_views", "resolution", "split_seed")
@@ -244,8 +244,8 @@ class SphericalView(NamedTuple):
 
 
 def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list[SphericalView], Counter[str]]:
-    """The views of an object that are near enough to a spherical camera's, and how many are not, by reason; `points`
-    `[P, 3]` are on its bounding box."""
+    """The views of an object that are close enough to a spherical camera's, and the number of others by reason;
+    `points` `[P, 3]` are on its bounding box."""
     if not photographs:
         return [], Counter()
     cameras = torch.stack([photograph.camera for photograph in photographs])
@@ -265,8 +265,8 @@ def sound_views(photographs: Sequence[Photograph], points: Tensor) -> tuple[list
 
 
 def spread(directions: NDArray[np.floating], count: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """Indices `[count]` of unit vectors `[V, 3]` that are spread evenly: a random one, then ever the one that is
-    farthest from those already there (farthest-point sampling)."""
+    """Indices `[count]` of evenly spread unit vectors `[V, 3]`: a random one, then repeatedly the one farthest from
+    those already chosen (farthest-point sampling)."""
     chosen = [int(random.integers(len(directions)))]
     nearest = directions @ directions[chosen[0]]
     while len(chosen) < count:
@@ -278,7 +278,7 @@ def spread(directions: NDArray[np.floating], count: int, random: np.random.Gener
 
 def crop(view: SphericalView, size: int) -> Image.Image:
     """The object-centric crop of a photograph, RGBA of `size` pixels a side, transparent where the mask is dark and
-    beyond the photograph."""
+    outside the photograph."""
     photograph = view.photograph
     cut = photograph.colours()
     cut.putalpha(photograph.opacity())

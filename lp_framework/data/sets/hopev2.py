@@ -5,10 +5,10 @@
     <path>/<split>/<scene>/scene_gt.json                obj_id, cam_R_m2c, cam_t_m2c (millimetres, or metres)
     <path>/<split>/<scene>/scene_gt_info.json           visib_fract of every instance
     <path>/<split>/<scene>/rgb/000000.png               or .jpg
-    <path>/<split>/<scene>/mask_visib/000000_000000.png of an instance, by image and place in scene_gt.json
+    <path>/<split>/<scene>/mask_visib/000000_000000.png of an instance, by image and index in scene_gt.json
 
-Model coordinates have +Z up. Cameras are OpenCV's, their pixels have whole numbers at the centre. Objects are named by
-their number, `obj_000001`, as their models are.
+Model coordinates have +Z up. Cameras are OpenCV's, with pixel centres at integer coordinates. Objects are named after
+their number, `obj_000001`, like their models.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ from lp_framework.registry import register
 
 MODELS = Path("models") / "models_info.json"
 ANNOTATIONS = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
-UNITS = {  # what takes cam_t_m2c to the unit of the models, and what that means
+UNITS = {  # factor from cam_t_m2c to the unit of the models, and its meaning
     1.0: "models and cam_t_m2c in the same unit",
     1000.0: "models in millimetres, cam_t_m2c in metres",
     0.001: "models in metres, cam_t_m2c in millimetres",
 }
-SAMPLES = 9  # masks of an object that its unit is told from
-FARTHEST_OFF = 8.0  # times larger or smaller than its masks show: an object that is of neither unit
+SAMPLES = 9  # masks of an object used to determine its unit
+FARTHEST_OFF = 8.0  # times larger or smaller than in its masks: neither unit fits
 
 
 class Instance(NamedTuple):
-    """An instance of an object in an image, as annotated: its pose and the image's camera as they are in the files."""
+    """An annotated instance of an object in an image: its pose and the image's camera as stored in the files."""
 
     scene: Path
     image: int
     mask: Path
-    visible: float  # share of the silhouette
+    visible: float  # fraction of the silhouette
     pose: Any
     camera: Any
 
@@ -67,9 +67,9 @@ class Instance(NamedTuple):
 class HOPEv2Data(PhotographedData):
     """HOPEv2 in BOP format: crops around every object, converted into `views` on first use.
 
-    Of the images in `splits` (folders of that name, or with a type after it as in `val_realsense`, as far as they are
-    there and have annotations), with at least `least_visible` of the object's silhouette visible, `train_views` +
-    `test_views` are chosen for their viewpoints.
+    `train_views` + `test_views` images with well-spread viewpoints and at least `least_visible` of the object's
+    silhouette visible are chosen from `splits`: folders of that name, or with a suffix as in `val_realsense`, if they
+    exist and have annotations.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class HOPEv2Data(PhotographedData):
         return {**super().demands(), "splits": self.splits, "least_visible": self.least_visible}
 
     def names(self) -> list[str]:
-        """The objects that have a model, `obj_000001` and so on, as far as they are chosen."""
+        """The selected objects that have a model, `obj_000001` and so on."""
         lists = kept_lists(self.path, {}, lambda: ObjectLists(sorted(self._frames()), []))
         return chosen(lists.seen, self.wanted, self.download)
 
@@ -108,7 +108,7 @@ class HOPEv2Data(PhotographedData):
         return Annotated(photographs, frame.corners(), +hidden, {"units": UNITS[unit]})
 
     def _frames(self) -> dict[str, ObjectFrame]:
-        """The objects' frames in those of their models; in their unit."""
+        """The objects' frames in the coordinates and unit of their models."""
         file, axes = self.download / MODELS, z_up_to_y_up(torch.eye(4, dtype=torch.float64))[:3, :3]
         with expecting(f"{file}: needs min_x, size_x, ... of every object by number"):
             frames = {}
@@ -132,7 +132,7 @@ class HOPEv2Data(PhotographedData):
             contents = [read_json(scene / file) for file in ANNOTATIONS]
             wanted = "need cameras, and obj_id and visib_fract of the same instances"
             with expecting(f"{scene}: {', '.join(ANNOTATIONS)} {wanted}"):
-                # Some pad the numbers of images with zeros.
+                # Some data sets pad image numbers with zeros.
                 cameras, poses, infos = ({int(image): entry for image, entry in each.items()} for each in contents)
                 for image, entries in poses.items():
                     for place, (pose, info) in enumerate(zip(entries, infos[image], strict=True)):
@@ -149,8 +149,8 @@ def _name(number: str | int) -> str:
 
 
 def _unit(instances: Sequence[Instance], frame: ObjectFrame, name: str) -> float:
-    """The key of `UNITS` by which an object is about as long as its masks show it; a warning where that is not 1."""
-    times = []  # what the masks show, in longest sides, by each unit
+    """The key of `UNITS` that best matches the object's length in its masks; warns if it is not 1."""
+    times = []  # length in the masks, in longest sides, for each unit
     for instance in instances[:: math.ceil(len(instances) / SAMPLES) or 1]:
         rotation, translation, intrinsics = instance.numbers()
         opacity = mask_opacity(read_mask(instance.mask), str(instance.mask))

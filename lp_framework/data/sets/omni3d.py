@@ -3,9 +3,9 @@
     <path>/<object>/images/011.png ...    RGBA, square, transparent background
     <path>/<object>/poses/011.npy ...     camera to world, 4 x 4 (OpenGL axes) in a world with +Z up
 
-The cameras look at the centre and stand upright; the object's size and the field of view are not on record. So the
-images stay as they are, and the scene is scaled until the median radius of an object's cameras is 1.85, as ID-Pose does
-(the mean of the radii on which Zero123 was trained). Results say then "units in which the reference's radius is 1.85".
+The cameras look at the centre and are upright; the object's size and the field of view are not recorded. The images are
+therefore kept unchanged, and the scene is scaled so that the median radius of an object's cameras is 1.85, as in
+ID-Pose (the mean radius in Zero123's training). Results then state "units in which the reference's radius is 1.85".
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RADIUS = 1.85
 
 @register("data", "omni3d")
 class Omni3DData(ConvertedSource):
-    """Views in ID-Pose's layout, all of them test views; converted into `views` on first use."""
+    """Views in ID-Pose's layout, all used as test views; converted into `views` on first use."""
 
     def __init__(self, path: str, views: str | None = None, objects: str | Sequence[str] | None = None) -> None:
         self.download, self.wanted = Path(path), objects
@@ -70,8 +70,8 @@ class Omni3DData(ConvertedSource):
 
 
 def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
-    """Cameras `[4, 4]` (float64) of an object by view, such as "011", with +Y up, their median radius 1.85; `UserError`
-    for a pose that is no upright camera that looks at the centre, and for fewer than two."""
+    """Cameras `[4, 4]` (float64) of an object by view, such as "011", with +Y up and a median radius of 1.85;
+    `UserError` for a pose that is not an upright camera looking at the centre, and for fewer than two."""
     folder = Path(root) / name / "poses"
     files = sorted(folder.glob("*.npy"))
     if len(files) < 2:

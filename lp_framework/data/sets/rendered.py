@@ -1,7 +1,7 @@
-"""Sources that render meshes: the embedded objects, folders of meshes, and scans as their authors release them.
+"""Sources that render meshes: the embedded objects, folders of meshes, and scans as released by their authors.
 
-Of GSO and OmniObject3D the paper takes the 70 objects each that iFusion rendered, and 10 more of GSO that are not
-trained on. Where iFusion's renderings are at hand (`renderings`), the seen objects are those; else they are drawn.
+Of GSO and OmniObject3D the paper uses the 70 objects each that iFusion rendered, and 10 held-out ones of GSO. If
+iFusion's renderings are available (`renderings`), the seen objects are theirs; otherwise they are drawn.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lp_framework.registry import register
 
 
 class Label(BaseModel):
-    """An object's ambiguity class and whether a view of it has one right longitude (None: as `MeshObject` has it)."""
+    """An object's ambiguity class and whether a view of it has one correct longitude (None: as in `MeshObject`)."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -40,20 +40,20 @@ class Label(BaseModel):
     reason: str | None = None
 
 
-UNLABELLED = Label.model_construct(ambiguity="unlabelled")  # which no file may say
+UNLABELLED = Label.model_construct(ambiguity="unlabelled")  # not allowed in files
 
 
 def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, Label]:
-    """The labels in a YAML file, by object; `names` are the objects in the folder `where`.
+    """Read the labels in a YAML file, by object; `names` are the objects in the folder `where`.
 
         bbq_sauce: {ambiguity: continuous, unique_answer: true, reason: "a bottle; its label is on one side"}
         butter: {ambiguity: twofold, reason: "a box that says something else on each side"}
 
-    Warns of objects that the file leaves out; they stay unlabelled. `UserError` naming file and object for what is
-    missing, no YAML, not in the folder, or no label.
+    Warns of objects missing from the file, which stay unlabelled. `UserError` naming the file and object for a missing
+    file, invalid YAML, an object not in the folder, or an invalid label.
     """
     with expecting(f"{path}: is not readable YAML"):
-        # Of text alone: 42 and 007 are names as they are written.
+        # Strings only: names such as 42 and 007 stay as written.
         content = yaml.load(path.read_text(encoding="utf-8"), yaml.BaseLoader)
     if not isinstance(content, dict):
         raise UserError(f"{path}: must give every object its label, as in 'mug: {{ambiguity: unique}}'")
@@ -74,9 +74,9 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
 
 
 class RenderedData(ViewSource):
-    """Views that are rendered from meshes on first use, into `path`, by a protocol with the settings `protocol`."""
+    """Views in `path` that are rendered from meshes on first use, by a protocol with the settings `protocol`."""
 
-    labels: Path | None = None  # a file that says the objects' ambiguity classes
+    labels: Path | None = None  # a file with the objects' ambiguity classes
 
     def __init__(self, renderer: Renderer, path: str | Path, workers: int | None, **protocol: Any) -> None:
         self.renderer, self.path, self.workers = renderer, Path(path), workers
@@ -90,11 +90,11 @@ class RenderedData(ViewSource):
         return sorted(obj.name for obj in self.objects())
 
     def prepare(self, check_meshes: bool = False) -> None:
-        """Render what is missing; the others must be of the files at hand, or with `check_meshes` of what they hold."""
+        """Render missing views; existing ones must match the available files or, with `check_meshes`, their meshes."""
         render_objects(self.objects(), self.path, self.protocol, self.renderer, self.workers, check_meshes)
 
     def views(self, name: str, split: str) -> ObjectViews:
-        """The views, with the label of the object, whatever they were rendered with; theirs where nothing labels it."""
+        """The views with the object's current label; with the label they were rendered with if it has none."""
         views, obj = super().views(name, split), self._by_name[name]
         if obj.ambiguity == "unlabelled" and self.labels is None:
             return views
@@ -135,15 +135,15 @@ class ToyData(RenderedData):
 
 @register("data", "meshes")
 class MeshData(RenderedData):
-    """A folder of meshes, in any formats that trimesh reads; rendered into `views`.
+    """A folder of meshes in any format that trimesh reads, rendered into `views`.
 
-    `unseen` of its objects are kept from training; `objects` says whether these or the others are in use, or names
-    those that are. `labels` is a YAML file with their ambiguity classes (see `read_labels`). The axis `up` of the files
+    `unseen` of its objects are held out from training; `objects` selects these or the others, or names individual
+    objects. `labels` is a YAML file with their ambiguity classes (see `read_labels`). The axis `up` of the files
     becomes our +Y.
     """
 
-    seen: int | None = None  # how many there are to train on, all but the unseen ones by default
-    renderings: Path | None = None  # a folder of views of those to train on, which are drawn by default
+    seen: int | None = None  # number of training objects, by default all except the unseen ones
+    renderings: Path | None = None  # a folder of views of the training objects, which are drawn by default
 
     def __init__(
         self,
@@ -172,7 +172,7 @@ class MeshData(RenderedData):
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:
-        """The objects in use, sorted by name; of the seen and unseen ones see `kept_lists`."""
+        """The selected objects, sorted by name; for seen and unseen ones see `kept_lists`."""
         if self.wanted not in ("seen", "unseen"):
             names = chosen([*self.files, "seen", "unseen"], self.wanted, self.meshes)
             return [self._object(name) for name in names]
@@ -198,11 +198,11 @@ class MeshData(RenderedData):
         return ObjectLists(seen, unseen)
 
     def loader(self, file: Path) -> Callable[[], trimesh.Scene]:
-        """What loads a mesh."""
+        """The function that loads a mesh."""
         return partial(load_scene, file, self.up)
 
     def origin(self, file: Path) -> Origin:
-        """A mesh, beside the materials, buffers and images that any in the folder may refer to."""
+        """A mesh, beside the materials, buffers and images that any mesh in the folder may use."""
         return Origin([file], self._beside, self.up)
 
     @cached_property
@@ -210,7 +210,7 @@ class MeshData(RenderedData):
         return Origin(self._parts(self.meshes))
 
     def _parts(self, folder: Path) -> list[Path]:
-        """The files below a folder that meshes refer to."""
+        """The files in a folder that meshes may refer to."""
         suffixes, views = {".mtl", ".bin", *Image.registered_extensions()}, self.path.resolve()
         found = (file for file in folder.resolve().rglob("*") if file.suffix.lower() in suffixes and file.is_file())
         return sorted(file for file in found if not file.is_relative_to(views) and file.name[0] != ".")
@@ -222,7 +222,7 @@ class MeshData(RenderedData):
 
     @cached_property
     def files(self) -> dict[str, Path]:
-        """The meshes in the folder by object; `UserError`, with the files looked for, where there are none."""
+        """The meshes in the folder by object; `UserError`, with the expected files, if there are none."""
         formats = sorted(f".{suffix}" for suffix in trimesh.available_formats())
         names = (f.name for f in self.meshes.glob("*") if f.suffix.lower() in formats and f.name[0] != ".")
         files: dict[str, Path] = {}
@@ -241,9 +241,9 @@ class ScannedData(MeshData):
     """Objects of a download, rendered into `views`, by default `datasets/` and the name of the `release`."""
 
     release: ClassVar[str]
-    what: ClassVar[str]  # there is in the download
-    layout: ClassVar[str]  # where the meshes are, each two folders below the one that has its object's name
-    axis: ClassVar[Literal["y", "z"]] = "y"  # which points up
+    what: ClassVar[str]  # the kind of objects in the download
+    layout: ClassVar[str]  # glob of the meshes, each two folders below the one named after its object
+    axis: ClassVar[Literal["y", "z"]] = "y"  # the up axis
 
     def __init__(
         self,
@@ -278,14 +278,14 @@ class ScannedData(MeshData):
         return {name: found[name] for name in names_below(self.meshes, found, self.what, self.meshes / self.layout)}
 
     def origin(self, file: Path) -> Origin:
-        """A mesh and what lies in the folder of its object."""
+        """A mesh and the other files in its object's folder."""
         return Origin([file, *self._parts(file.parents[1])])
 
 
 def load_scan(path: Path, up: Literal["y", "z"]) -> trimesh.Scene:
-    """`load_scene` of a scan, whose material and texture must be there; `UserError` where they are not.
+    """Load a scan by `load_scene`; `UserError` if its material or texture is missing.
 
-    The materials of GSO name their textures without the folder in which they are released.
+    GSO's materials name their textures without the folder in which they are released.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", MissingColourWarning)
