@@ -1,7 +1,7 @@
-"""Reading mesh files as their authors' viewers do.
+"""Reading mesh files the way their authors' viewers do.
 
-trimesh is the reader. What it passes over is put into terms that it reads, or named in a warning or an error: never
-drawn wrong in silence.
+trimesh is the reader. Features that it ignores are converted to supported ones, or reported in a warning or an error;
+nothing is silently drawn wrong.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from lp_framework.errors import UserError
 
 
 def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
-    """The scene of a mesh file; the files that it names are looked for in `folders`.
+    """Read a mesh file as a scene; files that it refers to are searched for in `folders`.
 
-    Warns of what is not drawn. Raises `UserError` for what makes the file unreadable, and whatever the parsers raise.
+    Warns of what is not drawn. Raises `UserError` for unsupported files, and any exception of the parsers.
     """
     match path.suffix.lower():
         case ".gltf" | ".glb":
@@ -47,7 +47,7 @@ def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
 
 
 def read_ply(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
-    """The scene of a .ply file, whose texture is looked for in `folders`."""
+    """Read a .ply file as a scene; its texture is searched for in `folders`."""
     content = path.read_bytes()
     header = content.partition(b"\nend_header")[0].decode("utf-8")
     names = list(dict.fromkeys(re.findall(r"^comment\s+TextureFile\s+(.*?)\s*$", header, re.MULTILINE | re.I)))
@@ -59,7 +59,7 @@ def read_ply(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
 
 
 def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
-    """Leave out faces at places that are not numbers, and merge vertices that are the same."""
+    """Remove faces with non-finite coordinates, and merge identical vertices."""
     faces = len(mesh.faces)
     if not np.isfinite(mesh.vertices).all():
         mesh.remove_infinite_values()
@@ -68,15 +68,15 @@ def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
     uv = getattr(mesh.visual, "uv", None)
     if uv is not None and (lost := (~(np.abs(uv[mesh.faces]) < FARTHEST)).any(axis=(1, 2)).sum()):
         warn(path, f"{lost} of {faces} triangles have no proper texture coordinates; they show the texture's corner")
-    # glTF's vertices are distinct by its standard, others where their colours are.
+    # glTF's vertices are distinct by its standard, others if they have their own colours.
     coloured = getattr(mesh.visual, "kind", None) == "vertex" or "color" in mesh.vertex_attributes
     if path.suffix.lower() not in (".gltf", ".glb") and not coloured:
-        with np.errstate(invalid="ignore"):  # texture coordinates that are not numbers
+        with np.errstate(invalid="ignore"):  # non-finite texture coordinates
             mesh.process()
 
 
 def _left_out(mesh: trimesh.Trimesh) -> set[str]:
-    """What a material asks for that no renderer draws. `ValueError` for a texture that none can."""
+    """Features of a mesh's material that no renderer draws. `ValueError` for a texture that none can draw."""
     material = getattr(mesh.visual, "material", None)
     if isinstance(material, PBRMaterial):
         image, factor, light = material.baseColorTexture, material.baseColorFactor, material.emissiveFactor

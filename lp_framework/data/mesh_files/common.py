@@ -1,4 +1,4 @@
-"""What the readers share: the files that a mesh file names, found as other viewers find them or named in a warning."""
+"""Shared by the readers: finding the files that a mesh file refers to, as other viewers do, or warning of them."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from trimesh.visual.material import SimpleMaterial, empty_material
 from lp_framework.errors import UserError
 
 LINEAR_COLOUR = "_LINEAR_COLOUR"  # a vertex attribute of trimesh: linear colours [V, 3 | 4] in [0, 1]
-WRAP = "wrap"  # in a mesh's metadata: how its texture goes on beyond its sides, across and up
-FARTHEST = 1e6  # texture coordinates beyond say nothing in single precision
-REPEAT, CLAMP, MIRROR = 10497, 33071, 33648  # OpenGL's numbers, which glTF has too
+WRAP = "wrap"  # key in a mesh's metadata: the wrap modes of its texture, across and up
+FARTHEST = 1e6  # larger texture coordinates are meaningless in single precision
+REPEAT, CLAMP, MIRROR = 10497, 33071, 33648  # OpenGL's constants, also used by glTF
 
 
 class MissingColourWarning(UserWarning, UserError):
-    """A mesh file names a texture or material that is not there, or gives a part no colour; `warnings` can make it an
-    error, which then is the user's."""
+    """A mesh file refers to a missing texture or material, or leaves a part without colour; also a `UserError`, which
+    `warnings` can raise."""
 
 
 def warn(path: Path, what: str, category: type[UserWarning] = UserWarning) -> None:
-    """Warn of `what` is not drawn as the mesh file `path` has it."""
+    """Warn of `what` in the mesh file `path` is not drawn as given."""
     warnings.warn(f"{path}: {what}", category, stacklevel=3)
 
 
 def find(name: str, folders: Iterable[Path]) -> Path | None:
-    """The file that `name` in a mesh file means: below one of `folders`, as it is written, with backslashes, with `%20`
-    for a space, in other letter case, or, as the last resort, beside the mesh wherever the name puts it."""
+    """Find the file that `name` in a mesh file refers to, below one of `folders`: as written, with backslashes, with
+    `%20` for a space, with different letter case, or, as a last resort, by its last component alone."""
     spellings = [spelling.strip('"').replace("\\", "/") for spelling in (name, unquote(name))]
     for spelling in (*spellings, *(spelling.rpartition("/")[2] for spelling in spellings)):
         for folder in folders:
@@ -49,18 +49,18 @@ def find(name: str, folders: Iterable[Path]) -> Path | None:
 
 def _in_any_case(folder: Path, name: str) -> Path | None:
     for part in PurePosixPath(name).parts:
-        if not os.path.exists(folder / part) and os.path.isdir(folder):  # Path.exists fails for an impossible name
+        if not os.path.exists(folder / part) and os.path.isdir(folder):  # Path.exists raises for an invalid name
             part = next((each for each in sorted(os.listdir(folder)) if each.lower() == part.lower()), part)
         folder = folder / part
     return folder if os.path.isfile(folder) else None
 
 
 def readable_image(data: bytes | None) -> bool:
-    """Whether these are the bytes of an image that Pillow reads."""
+    """Whether Pillow can read these bytes as an image."""
     try:
         with Image.open(io.BytesIO(data or b"")) as image:
             image.load()
-    except Exception:  # its decoders raise anything from OSError to struct.error
+    except Exception:  # its decoders raise any exception from OSError to struct.error
         return False
     return True
 
@@ -72,7 +72,7 @@ def warn_of_texture(path: Path, name: str) -> None:
 
 
 def texture_bytes(path: Path, name: str, folders: Iterable[Path]) -> bytes | None:
-    """The file of a texture of the mesh file `path`; None, after a warning, where there is no readable image."""
+    """Read a texture of the mesh file `path`; None, after a warning, if it is not a readable image."""
     found = find(name, folders)
     data = None if found is None else found.read_bytes()
     if readable_image(data):
@@ -82,12 +82,12 @@ def texture_bytes(path: Path, name: str, folders: Iterable[Path]) -> bytes | Non
 
 
 def load(kind: str, file: io.IOBase, files: dict[str, bytes | str], **options: Any) -> trimesh.Scene:
-    """The scene that trimesh reads from an open file, with the `files` it may name; vertices are not merged yet."""
+    """The scene that trimesh reads from an open file that may refer to `files`; vertices are not merged yet."""
     content = mesh_loaders[kind](file, resolver=ZipResolver(files), **options)
     for mesh in content.get("geometry", {"": content}).values():
         mesh["process"] = False
         if "visual" in mesh and hash(getattr(mesh["visual"], "material", None)) == hash(empty_material()):
-            mesh["visual"].material = SimpleMaterial()  # instead of a grey texture
+            mesh["visual"].material = SimpleMaterial()  # replaces a grey texture
         for key in ("vertex_colors", "face_colors"):
             if mesh.get(key) is not None:
                 mesh[key] = _eight_bit_levels(np.asarray(mesh[key]))
@@ -95,7 +95,7 @@ def load(kind: str, file: io.IOBase, files: dict[str, bytes | str], **options: A
 
 
 def _eight_bit_levels(colours: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colours of 8 bits from any that files have: 8 or 16 bits, or numbers up to 1, or up to 255."""
+    """Convert colours to 8 bits from 8 or 16 bits, or from numbers up to 1 or up to 255."""
     if colours.dtype == np.uint16:
         colours = colours / 257
     elif colours.dtype.kind == "f" and not (colours > 1.5).any():

@@ -1,8 +1,8 @@
-"""glTF, as the standard (2.0) says.
+"""glTF according to the standard (2.0).
 
-trimesh reads the scene's nodes, its triangles, materials and images, and passes over the rest. That is put into the
-terms that it reads before it sees the file, or refused, or named in a warning; a file without any of it goes through as
-it is.
+trimesh reads a scene's nodes, triangles, materials and images, and ignores the rest. Other features are converted to
+supported ones before trimesh sees the file, rejected with an error, or reported in a warning; files without them are
+passed on unchanged.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lp_framework.errors import UserError
 SUPPORTED = (
     "KHR_mesh_quantization", "KHR_texture_transform", "EXT_mesh_gpu_instancing", "EXT_texture_webp",
     "EXT_texture_avif", "MSFT_texture_dds", "KHR_node_visibility",
-    # These say how light falls on a material, or where lamps are.
+    # These define shading or light sources.
     "KHR_materials_", "KHR_lights_", "EXT_lights_",
 )  # fmt: skip
 COLOUR_TEXTURES, GLOSS_TEXTURE = ("baseColorTexture", "diffuseTexture"), "specularGlossinessTexture"
@@ -45,8 +45,8 @@ TRIANGLES, TRIANGLE_FAN = 4, 6
 
 
 def read_gltf(path: Path) -> trimesh.Scene:
-    """The scene of a .gltf or .glb file. A mesh has its vertex colours, if any, in `vertex_attributes[LINEAR_COLOUR]`
-    and how its texture wraps in `metadata[WRAP]`. Raises `UserError` for an extension that is required and unknown."""
+    """Read a .gltf or .glb file. Meshes have vertex colours, if any, in `vertex_attributes[LINEAR_COLOUR]` and their
+    texture's wrap modes in `metadata[WRAP]`. Raises `UserError` for an unsupported required extension."""
     file = _File(path)
     file.instances()
     textures = file.textures()
@@ -64,7 +64,7 @@ def read_gltf(path: Path) -> trimesh.Scene:
 
 
 class _File:
-    """The header of a glTF file and its buffers; its methods rewrite the header, and add to the buffers."""
+    """The header of a glTF file and its buffers; methods rewrite the header and append buffers."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -73,7 +73,7 @@ class _File:
             if not extension.startswith(SUPPORTED):
                 raise self._unsupported(extension)
         self.buffers: list[bytes] = []
-        self.images: dict[int, bytes | None] = {}  # those of textures, by index
+        self.images: dict[int, bytes | None] = {}  # images of textures, by index
         for buffer in self.header.get("buffers", []):
             if "uri" not in buffer and "extensions" in buffer:
                 raise self._unsupported(next(iter(buffer["extensions"])))
@@ -83,7 +83,7 @@ class _File:
             self.buffers.append(data)
 
     def scene(self) -> trimesh.Scene:
-        """What trimesh makes of the file now; the name of a material is its index."""
+        """Load the rewritten file with trimesh; the name of a material is its index."""
         files = {f"buffer{index}": buffer for index, buffer in enumerate(self.buffers)}
         files |= {f"image{index}": image for index, image in self.images.items() if image is not None}
         for index, buffer in enumerate(self.header.get("buffers", [])):
@@ -91,11 +91,11 @@ class _File:
         for index, material in enumerate(self.header.get("materials", [])):
             material["name"] = str(index)
         for node in self.header.get("nodes", []):
-            node.pop("camera", None)  # trimesh leaves out what lies below
+            node.pop("camera", None)  # trimesh drops the children of cameras
             if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
                 node.pop("mesh", None)
                 node.pop("children", None)
-        # Only those that colour the object are drawn.
+        # Only images that colour the object are drawn.
         self.header["images"] = [{"uri": f"image{index}"} for index in range(len(self.header.get("images", [])))]
         header = io.BytesIO(json.dumps(self.header).encode())
         return trimesh.load_scene(header, file_type="gltf", resolver=ZipResolver(files))
@@ -145,7 +145,7 @@ class _File:
     # ------------------------------------------------------------ meshes
 
     def geometry(self, primitive: dict[str, Any]) -> None:
-        """Positions and indices without normalized or sparse accessors, and fans as triangles."""
+        """Replace normalized and sparse accessors of positions and indices, and convert fans to triangles."""
         attributes, accessors = primitive["attributes"], self.header["accessors"]
         compressed = [name for name in primitive.pop("extensions", {}) if not name.startswith(SUPPORTED)]
         if compressed and not {"bufferView", "sparse"} & set(accessors[attributes["POSITION"]]):
@@ -161,7 +161,7 @@ class _File:
             primitive |= {"mode": TRIANGLES, "indices": self._store(fan.reshape(-1, 1))}
 
     def colours(self, primitive: dict[str, Any]) -> None:
-        """Vertex colours as floats in an attribute of our own, for trimesh takes them for sRGB of 8 bits."""
+        """Move vertex colours to our own attribute, as floats, because trimesh assumes 8-bit sRGB."""
         if (index := primitive["attributes"].pop("COLOR_0", None)) is not None:
             colours = self._values(index)
             if colours.dtype.kind != "f":
@@ -169,7 +169,7 @@ class _File:
             primitive["attributes"][LINEAR_COLOUR] = self._store(colours)
 
     def texture_coordinates(self, primitive: dict[str, Any], textures: dict[int, dict[str, Any]]) -> None:
-        """The coordinates of the texture as the first ones, moved by the texture's transform."""
+        """Make the texture's coordinates the first ones, with the texture's transform applied."""
         texture, attributes = textures.get(primitive.get("material", -1)), primitive["attributes"]
         transform = {} if texture is None else texture.get("extensions", {}).get("KHR_texture_transform", {})
         number = 0 if texture is None else transform.get("texCoord", texture.get("texCoord", 0))
@@ -180,13 +180,13 @@ class _File:
         accessor = self.header["accessors"][index]
         if transform or accessor["componentType"] != FLOAT or "sparse" in accessor:
             angle, scale = transform.get("rotation", 0.0), transform.get("scale", (1.0, 1.0))
-            # Counter-clockwise as one sees it: v points down.
+            # Counter-clockwise on screen, because v points down.
             turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
             index = self._store(self._values(index) * scale @ turn.T + transform.get("offset", (0.0, 0.0)))
         attributes["TEXCOORD_0"] = index
 
     def instances(self) -> None:
-        """A node of its own for each of the instances of a mesh (EXT_mesh_gpu_instancing)."""
+        """Create a separate node for each instance of a mesh (EXT_mesh_gpu_instancing)."""
         for node in [*self.header.get("nodes", [])]:
             if instancing := node.get("extensions", {}).get("EXT_mesh_gpu_instancing"):
                 mesh, attributes = node.pop("mesh"), instancing["attributes"]
@@ -197,7 +197,7 @@ class _File:
                     self.header["nodes"].append({"mesh": mesh, **moved})
 
     def say_what_is_left_out(self) -> None:
-        """Warn of what moves vertices and is not applied."""
+        """Warn of skins and morph targets that are not applied."""
         nodes, meshes = self.header.get("nodes", []), self.header.get("meshes", [])
         if any("skin" in node for node in nodes):
             warn(self.path, "its skeleton (skins) is left out; it is drawn as its meshes are modelled")
@@ -207,12 +207,12 @@ class _File:
     # ------------------------------------------------------------ textures
 
     def textures(self) -> dict[int, dict[str, Any]]:
-        """By material the reference to the texture that colours it; each texture's source is an image that is read."""
+        """The reference to the colour texture of each material; sets each texture's source to a readable image."""
         found, wanted = {}, set()
         for index, material in enumerate(self.header.get("materials", [])):
             colours = material.get("pbrMetallicRoughness", {})
             colours = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", colours)
-            # trimesh makes the colour of the older kind of material from both of its textures.
+            # trimesh computes the colour of specular-glossiness materials from both of their textures.
             wanted |= {colours[key]["index"] for key in (*COLOUR_TEXTURES, GLOSS_TEXTURE) if key in colours}
             for key in COLOUR_TEXTURES:
                 if key in colours:
@@ -222,7 +222,7 @@ class _File:
         return found
 
     def _choose_source(self, texture: dict[str, Any]) -> None:
-        """The first image of a texture that is read, those of its extensions before its own."""
+        """Choose the first readable image of a texture; extensions take precedence over its own source."""
         named = []
         for each in (*texture.pop("extensions", {}).values(), {"source": texture.pop("source", None)}):
             if (source := each.get("source")) is None:
@@ -241,7 +241,7 @@ class _File:
         warn_of_texture(self.path, " or ".join(named) or "without an image")
 
     def wrap(self, texture: dict[str, Any] | None) -> tuple[int, int]:
-        """How a texture goes on beyond its sides, across and up."""
+        """The wrap modes of a texture, across and up."""
         sampler = {} if texture is None else self.header["textures"][texture["index"]]
         if "sampler" in sampler:
             sampler = self.header["samplers"][sampler["sampler"]]

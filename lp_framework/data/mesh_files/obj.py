@@ -1,7 +1,7 @@
 """Wavefront OBJ with its materials, as other viewers read it.
 
-trimesh reads the geometry. What it passes over is put into terms that it reads: all material files as one, textures
-where they are found, indices that count backwards. The options of a texture are applied to its coordinates.
+trimesh reads the geometry. Features that it ignores are converted first: several material files are merged, textures
+are located, negative indices are made positive. The options of a texture are applied to its coordinates.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from lp_framework.data.mesh_files.common import (
     warn,
 )
 
-MATERIALS = "materials.mtl"  # what trimesh is given as the one material file
-OPTION = re.compile(  # of a texture, before its name
+MATERIALS = "materials.mtl"  # the merged material file passed to trimesh
+OPTION = re.compile(  # of a texture, given before its name
     r"-(?P<name>[ost])(?P<numbers>(?:\s+[-+.\deE]+(?=\s)){1,3})\s+|-clamp\s+(?P<clamp>on|off)\s+"
     r"|-mm\s+\S+\s+\S+\s+|-(?:blendu|blendv|boost|bm|cc|imfchan|texres|type)\s+\S+\s+",
     re.IGNORECASE,
@@ -36,7 +36,7 @@ OPTION = re.compile(  # of a texture, before its name
 
 @dataclass
 class Mapping:
-    """How a texture lies on a surface: coordinates times `scale` plus `offset`; clamped at its sides, or repeated."""
+    """How a texture maps to a surface: coordinates times `scale` plus `offset`; clamped or repeated at its sides."""
 
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
@@ -44,19 +44,19 @@ class Mapping:
 
 
 def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
-    """The scene of an .obj file, whose material files and textures are looked for in `folders`; a mesh has the wrap of
-    its texture in `metadata[WRAP]`."""
+    """Read an .obj file as a scene; material files and textures are searched for in `folders`. Meshes have their
+    texture's wrap modes in `metadata[WRAP]`."""
     text = _read(path)
     if re.search(r"^f[ \t].*?[ \t/]-\d", text, re.MULTILINE):
         text = _counting_forwards(text)
-    if re.search(r"^v(?:[ \t]+\S+){6}", text, re.MULTILINE):  # trimesh wants a colour at every vertex
+    if re.search(r"^v(?:[ \t]+\S+){6}", text, re.MULTILINE):  # trimesh needs a colour at every vertex
         text = re.sub(r"^(v(?:[ \t]+[^\s#]+){3})[ \t]*$", r"\1 1 1 1", text, flags=re.MULTILINE)
     libraries = _libraries(path, text, folders)
     read = {file: _read(file) for file in libraries if file is not None}
     used = dict.fromkeys(re.findall(r"^usemtl[ \t]+(.*?)[ \t]*$", text, re.MULTILINE))
     newmtl = re.compile(r"^[ \t]*newmtl[ \t]+(.*?)[ \t]*$", re.MULTILINE | re.IGNORECASE)
     known = [name for library in read.values() for name in newmtl.findall(library)]
-    if not used and known:  # other viewers take the first
+    if not used and known:  # other viewers use the first
         used, text = {known[0]: None}, f"usemtl {known[0]}\n{text}"
     if None not in libraries and (unknown := [name for name in used if name not in known]):
         warn(path, f"its material {' and '.join(unknown)} is in none of its material files", MissingColourWarning)
@@ -71,12 +71,12 @@ def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
 
 
 def _read(path: Path) -> str:
-    # File names in other encodings pass through as they are.
+    # Preserve file names in other encodings.
     return path.read_text(encoding="utf-8-sig", errors="surrogateescape")
 
 
 def _libraries(path: Path, text: str, folders: Sequence[Path]) -> list[Path | None]:
-    """The material files that a text names; None, after a warning, for one that is not there."""
+    """The material files that a text refers to; None, after a warning, for a missing one."""
     found = []
     for names in re.findall(r"^mtllib[ \t]+(.*?)[ \t]*$", text, re.MULTILINE):
         for name in [names] if find(names, folders) else names.split():  # one name with spaces, or several names
@@ -89,7 +89,7 @@ def _libraries(path: Path, text: str, folders: Sequence[Path]) -> list[Path | No
 def _with_textures(
     path: Path, libraries: dict[Path, str], used: dict[str, None], folders: Sequence[Path]
 ) -> tuple[str, dict[str, Mapping], dict[str, bytes]]:
-    """The materials of all files, with textures called 0, 1, ...; how they map these; and the textures' bytes."""
+    """The materials of all files, with textures named 0, 1, ...; mappings by material; and texture bytes."""
     lines: list[str] = []
     mappings: dict[str, Mapping] = {}
     files: dict[str, bytes] = {}
@@ -110,7 +110,7 @@ def _with_textures(
 
 
 def _options(value: str) -> tuple[Mapping, str]:
-    """The mapping that the options before a texture's name make, and the name."""
+    """Parse the options before a texture's name: its mapping, and the name."""
     value, mapping = value.strip(), Mapping()
     while option := OPTION.match(value):
         u, v, *_ = (*map(float, (option["numbers"] or "").split()), None, None)
@@ -126,8 +126,8 @@ def _options(value: str) -> tuple[Mapping, str]:
 
 
 def _counting_forwards(text: str) -> str:
-    """The text with indices of faces that count back from the lines so far (-1 is the last) as those that count from
-    the first line (1)."""
+    """Convert face indices that count back from the current line (-1 is the last) to indices from the start (1 is the
+    first)."""
     counts = {"v": 0, "vt": 0, "vn": 0}
     lines = []
     for line in text.splitlines():
