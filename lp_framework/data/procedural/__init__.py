@@ -1,7 +1,7 @@
-"""Procedural objects without end: textured things as they stand about a house, each made from two numbers.
+"""An unlimited supply of procedural objects: textured household objects, each generated from two numbers.
 
-Read from the bottom up: `paint` and `solids`, `textures` (colours, patterns, pictures), `labels` (prints of packages)
-and `shapes`, then the families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which picks among them.
+Read bottom-up: `paint` and `solids`, `textures` (colours, patterns, pictures), `labels` (prints of packages) and
+`shapes`, then the families (`groceries`, `crockery`, `furniture`, `things`), and `objects`, which chooses among them.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ GLAZES = ("white", "white", "white", "pale", "vivid", "deep", "brown", "grey", "
 
 
 def glaze(random: Generator) -> Image.Image:
-    """A texture for round things that is the same all the way round, or repeats: plain, level bands, a frieze."""
+    """A texture for round objects that is constant or periodic around them: plain, horizontal bands, a frieze."""
     base, kind = colour(random, pick(random, GLAZES)), random.random()
     image = Image.new("RGB", (512, 512), base)
     if kind < 0.3:
@@ -31,7 +31,7 @@ def glaze(random: Generator) -> Image.Image:
 
 
 def scene_around(random: Generator) -> Image.Image:
-    """A texture for round things that differs all the way round: pictures, or prints side by side."""
+    """A texture for round objects without repetition around them: pictures, or prints side by side."""
     image, kind = Image.new("RGB", (512, 512), colour(random, pick(random, GLAZES))), random.random()
     if kind < 0.6:
         base = colour_at(image)
@@ -49,14 +49,14 @@ def scene_around(random: Generator) -> Image.Image:
 
 
 def outside(random: Generator, foot: float, belly: float, rim: float, height: float) -> Array:
-    """Points (radius, height) of a vessel's outside, from its foot to its rim."""
+    """Outer profile (radius, height) of a vessel, from its foot to its rim."""
     widest, knee = random.uniform(0.4, 0.7), 0.4 * foot + 0.6 * belly
     knots = [(foot, 0), (knee, 0.18 * height), (belly, widest * height), (rim, height)]
     return np.concatenate([[(0.98 * foot, 0)], curve(knots, 10)])
 
 
 def mug(random: Generator) -> Parts:
-    """A mug or a cup with a handle, printed, patterned or plain, some on a saucer."""
+    """A mug or cup with a handle, printed, patterned or plain, sometimes on a saucer."""
     high, foot = random.uniform((0.6, 0.2), (1.1, 0.36))
     profile = np.array([(0.38, 0), (0.4, 0.03), (0.4, 0.5 * high), (0.4, high)])
     if chance(random, 0.6):
@@ -94,7 +94,7 @@ def vase(random: Generator, told: bool) -> Parts:
 
 
 def pan(random: Generator) -> Parts:
-    """A frying pan or a saucepan with its long handle."""
+    """A frying pan or saucepan with a long handle."""
     high, wide, long, rise = random.uniform((0.07, 0.3, 0.35, 0), (0.4, 0.42, 0.75, 0.15))
     path = curve([(wide - 0.02, 0.85 * high, 0), (wide + 0.3 * long, high + rise, 0), (wide + long, high, 0)], 12)
     grip = tube(path, np.linspace(0.025, random.uniform(0.03, 0.05), 12), 12).scale(z=random.uniform(1, 1.6))
@@ -103,7 +103,7 @@ def pan(random: Generator) -> Parts:
 
 
 def pot(random: Generator) -> Parts:
-    """A cooking pot with two grips and a lid, the same after half a turn."""
+    """A cooking pot with two handles and a lid, unchanged by half a turn."""
     high, paint, other = random.uniform(0.25, 0.6), plain(colour(random)), plain(colour(random))
     grips, knob = pair(handle(0.4, 0.6 * high, 0.85 * high, 0.14, 0.025, 2.5)), cylinder(0.05, 0.08, 0.015, 20)
     lid = lathe([(0.42, high), (0.43, high + 0.02), (0.25, high + 0.05), (0, high + 0.06)], 48)
@@ -112,7 +112,7 @@ def pot(random: Generator) -> Parts:
 
 
 def teapot(random: Generator) -> Parts:
-    """A teapot, kettle, coffee pot or watering can: a spout, a handle at the back or over the top, mostly a lid."""
+    """A teapot, kettle, coffee pot or watering can: a spout, a handle at the back or over the top, usually a lid."""
     high, belly, foot, rim = random.uniform((0.45, 0.3, 0.2, 0.14), (0.9, 0.42, 0.32, 0.26))
     image = scene_around(random) if chance(random, 0.45) else glaze(random)
     paint = plain(colour_at(image))
@@ -131,7 +131,7 @@ def teapot(random: Generator) -> Parts:
 
 
 def cutlery(random: Generator) -> Parts:
-    """A spoon, a fork, a knife, a spatula, or some of them side by side."""
+    """A spoon, fork, knife or spatula, or several of them side by side."""
     steel = material(random, "grey", "grey", "black", "brown", "vivid", grained=0.2)
     grip = steel if chance(random, 0.5) else material(random, "brown", "black", "vivid", grained=0.4)
     parts: Parts = []

@@ -1,4 +1,4 @@
-"""Furniture and containers, mostly of boards: cabinets, tables, chairs, sofas, racks, boxes, lamps, taps."""
+"""Furniture and containers, mostly made of boards: cabinets, tables, chairs, sofas, racks, boxes, lamps, taps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def timber(random: Generator) -> Image.Image:
 
 
 def cabinet(random: Generator) -> Parts:
-    """A cabinet, bookcase or night stand: open in front, some of it closed by drawers and doors."""
+    """A cabinet, bookcase or night stand: open in front, partly closed by drawers and doors."""
     x, y, z, w = random.uniform((0.4, 0.4, 0.3, 0.02), (1.1, 1.2, 0.7, 0.05))
     storeys = int(random.integers(1, 5))
     frame = pair(board(w, y, z).move((x - w) / 2)) + board(x, w, z).move(y=(w - y) / 2)
@@ -45,7 +45,7 @@ def cabinet(random: Generator) -> Parts:
 
 
 def table(random: Generator, alike: bool) -> Parts:
-    """A table or a bench; one that is not `alike` after half a turn is a desk with drawers at one end."""
+    """A table or bench; unless it looks `alike` after half a turn, a desk with drawers at one end."""
     x, y, z, w, leg = random.uniform((0.7, 0.35, 0.4, 0.03, 0.04), (1.2, 0.8, 0.7, 0.07, 0.1))
     legs = four(board(leg, y, leg).move((x - leg) / 2 - 0.02, -y / 2, (z - leg) / 2 - 0.02))
     if chance(random, 0.4):
@@ -115,7 +115,7 @@ def rack(random: Generator) -> Parts:
 
 
 def container(random: Generator, alike: bool) -> Parts:
-    """A box, tray or crate, open above or at both ends; unless `alike` after half a turn, a caddy with a high end."""
+    """A box, tray or crate, open on top or at both ends; unless `alike` after half a turn, a caddy with a high end."""
     x, z, y, w = random.uniform((0.6, 0.4, 0.12, 0.02), (1, 0.7, 0.6, 0.04))
     paint, planks = plain(colour(random)) if alike else timber(random), pick(random, (1, 1, 2, 3))
     walls = board(x, w, z)
@@ -124,7 +124,7 @@ def container(random: Generator, alike: bool) -> Parts:
         walls += both(board(x, high, w).move(0, middle, (z - w) / 2) + board(w, high, z - w).move((x - w) / 2, middle))
     if alike and chance(random, 0.3):  # a cube without ends
         walls = both(board(x, w, z).move(y=-z / 2) + board(w, z, z).move((x - w) / 2)) + board(x, w, z).move(y=z / 2)
-    elif chance(random, 0.4):  # grips over the ends
+    elif chance(random, 0.4):  # handles over the ends
         grip = board(w, 0.05, 0.5 * z).move((x - w) / 2, y + 0.1)
         walls += pair(grip) + four(board(w, 0.12, 0.04).move((x - w) / 2, y + 0.05, 0.22 * z))
     if not alike:
@@ -135,7 +135,7 @@ def container(random: Generator, alike: bool) -> Parts:
 
 
 def lamp(random: Generator) -> Parts:
-    """A desk lamp with a bent arm, its shade turned to one side."""
+    """A desk lamp with a bent arm and its shade turned to one side."""
     foot, high, reach = random.uniform((0.16, 0.6, 0.25), (0.28, 0.9, 0.5))
     thick, wide, tilt = random.uniform((0.015, 0.13, 10), (0.03, 0.25, 60))
     path = curve([(0, 0, 0), (-0.1 * reach, 0.5 * high, 0), (0.2 * reach, high, 0), (reach, 0.97 * high, 0)], 20)

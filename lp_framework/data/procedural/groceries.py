@@ -14,7 +14,7 @@ from lp_framework.data.procedural.textures import chance, colour, ground, heap, 
 
 
 def printed_box(random: Generator, alike: bool = False) -> Parts:
-    """A box, lying, upright or about a cube; `alike`: the same print on front and back, and on both ends."""
+    """A box, lying, upright or roughly cubic; `alike`: the same print on front and back, and on both ends."""
     proportions = [(1, 0.25, 0.5), (1, 0.35, 0.6), (0.7, 1, 0.2), (0.5, 1, 0.35), (0.8, 0.9, 0.7), (1, 0.3, 0.3)]
     x, y, z = np.array(pick(random, proportions)) * random.uniform(0.8, 1.25, 3)
     b = brand(random)
@@ -28,7 +28,7 @@ def printed_box(random: Generator, alike: bool = False) -> Parts:
 
 
 def carton(random: Generator) -> Parts:
-    """A gabled carton of milk or juice."""
+    """A gable-top carton of milk or juice."""
     x, z, y = random.uniform((0.38, 0.36, 0.65), (0.6, 0.5, 1.0))
     b, sheet = brand(random), Image.new("RGB", (512, 256))
     sides = zip(four_sides(random, b, x, z, y), (x, z, x, z), strict=True)
@@ -41,8 +41,8 @@ def carton(random: Generator) -> Parts:
 
 
 def bottle(random: Generator, flat: bool, told: bool = True) -> Parts:
-    """A bottle: `flat` ones are oval, with a label in front or on both sides; the label of round ones goes all the way
-    round where the longitude is to be `told`, otherwise it is in front alone or there is none."""
+    """A bottle: `flat` ones are oval, with a label in front or on both sides. Round ones have a label all the way round
+    if the longitude is `told` by it, otherwise a label in front or none."""
     b, wide, shoulder = brand(random), *random.uniform((0.26, 0.5), (0.42, 0.74))
     neck = random.uniform(0.4, 0.7) * wide if flat else random.uniform(0.09, 0.14)
     ratio, waist = random.uniform((0.45, 0.82), (0.75, 1.0)) if flat else (1.0, 1.0)
@@ -68,7 +68,7 @@ def bottle(random: Generator, flat: bool, told: bool = True) -> Parts:
 
 
 def tin(random: Generator, told: bool, exponent: float = 2.0) -> Parts:
-    """A can, jar, tub or canister; its label goes all the way round where the longitude is to be `told`."""
+    """A can, jar, tub or canister; its label goes all the way round if the longitude is `told` by it."""
     kind = pick(random, ("can", "can", "jar", "tub", "drum"))
     high = {"can": random.uniform(0.35, 1.4), "jar": 1.2, "tub": random.uniform(0.5, 1), "drum": 1.7}[kind]
     foot, top = random.uniform(0.7, 0.85) if kind == "tub" else 1.0, 0.85 if kind == "jar" else 1.0
@@ -82,7 +82,7 @@ def tin(random: Generator, told: bool, exponent: float = 2.0) -> Parts:
     if told:
         roles = zip(("front", "facts", "back", "story"), random.uniform(0.6, 1.0, 4), strict=True)
         around([panel(random, b, role, width, high * (stop - start)) for role, width in roles], start, stop, sheet)
-    else:  # glazed in one colour, or with a level band
+    else:  # glazed in one colour, or with a horizontal band
         sheet.paste(b.base, (0, 0, 512, 512))
         sheet.paste(pick(random, (b.base, b.second)), (0, 150, 512, 300))
     lid = body([(top + 0.02, top + 0.02, height) for height in (0.97 * high, high + 0.04)], exponent)
@@ -90,7 +90,7 @@ def tin(random: Generator, told: bool, exponent: float = 2.0) -> Parts:
 
 
 def pouch(random: Generator) -> Parts:
-    """A bag of crisps or coffee, welded at both ends."""
+    """A bag of crisps or coffee, sealed at both ends."""
     b, x, z = brand(random), *random.uniform((0.55, 0.18), (0.9, 0.4))
     half = [(x, 0.015, 0), (x, 0.03, 0.06), (0.96 * x, 0.7 * z, 0.22)]
     levels = [*half, (0.94 * x, z, 0.5), *((width, depth, 1 - height) for width, depth, height in half[::-1])]
@@ -100,7 +100,7 @@ def pouch(random: Generator) -> Parts:
 
 
 def paste_tube(random: Generator) -> Parts:
-    """A tube of paste that lies on its side."""
+    """A tube of paste lying on its side."""
     b, wide, long = brand(random), *random.uniform((0.2, 0.7), (0.32, 1.0))
     levels = np.array([(0.8, 0.8, 0), (1, 1, 0.08), (1.1, 0.8, 0.5), (1.5, 0.1, 1)]) * (wide, wide, long)
     sheet = ground(random, 512, 512, b.base, b.second, 0.5)
@@ -111,7 +111,7 @@ def paste_tube(random: Generator) -> Parts:
 
 
 def jug(random: Generator) -> Parts:
-    """A bottle of detergent or oil with a grip at its side, or with a trigger on top."""
+    """A bottle of detergent or oil with a handle at its side, or with a trigger on top."""
     b, wide, ratio, y = brand(random), *random.uniform((0.4, 0.45, 0.6), (0.6, 0.7, 0.75))
     levels = np.array([(0.95, 0), (1, 0.04), (0.95, 0.6 * y), (0.7, 0.85 * y), (0.25, y), (0.22, y + 0.08)])
     widths = wide * levels[:, 0]

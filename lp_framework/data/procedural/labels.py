@@ -1,4 +1,4 @@
-"""What is printed on packages: made-up brands, lettering in several fonts, and faces laid out from both."""
+"""Prints on packages: made-up brands, lettering in several fonts, and faces composed of both."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lp_framework.data.procedural import textures as tx
 from lp_framework.data.procedural.paint import Colour, pen, shade, star
 from lp_framework.data.procedural.textures import chance, colour, pick
 
-# All of matplotlib.
+# All ship with matplotlib.
 FONTS = """DejaVuSans-Bold DejaVuSans-BoldOblique DejaVuSans DejaVuSerif-Bold DejaVuSerif-BoldItalic DejaVuSansMono-Bold
 STIXGeneralBol STIXGeneralBolIta STIXGeneral STIXGeneralItalic cmb10 cmss10 cmr10 cmtt10"""
 
@@ -27,7 +27,7 @@ WORDS = "new classic original extra fine organic fresh light 500g 250ml 1kg stro
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom
 
-# What stands where on a face: elements and their boxes, in hundredths of its width and height.
+# Layouts of faces: elements and their boxes, in percent of the face's width and height.
 LAYOUTS = {
     "front": (
         "emblem 15 5 85 23, plate 0 27 100 50, title 7 27 93 50, motif 10 54 90 97",
@@ -64,7 +64,7 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class Brand:
-    """What the faces of a package share; `busy` of them have a pattern for ground."""
+    """What the faces of a package share; `busy` is the fraction with a pattern."""
 
     name: str
     product: str
@@ -102,7 +102,7 @@ def font(name: str, size: int = 56) -> ImageFont.FreeTypeFont:
 
 
 def letter(image: Image.Image, words: str, box: Box, fill: Colour, name: str, outline: Colour | None = None) -> None:
-    """Words as large as the box lets them be, in its middle, drawn out in height by up to a half."""
+    """Draw words centred in the box, as large as it allows, stretched in height by up to a half."""
     stroke = 5 if outline else 0
     left, top, right, bottom = font(name).getbbox(words, stroke_width=stroke)
     lettering = Image.new("RGBA", (int(right - left) + 4, int(bottom - top) + 4), (*(outline or fill), 0))
@@ -121,7 +121,7 @@ def about(x: float, y: float, half_width: float, half_height: float) -> Box:
 
 
 def small_print(random: Generator, image: Image.Image, box: Box, fill: Colour) -> None:
-    """Lines of words that fill the box."""
+    """Fill the box with lines of words."""
     size = int(np.clip((box[3] - box[1]) / 6, 7, 13))
     small = font(pick(random, ("DejaVuSans", "DejaVuSerif", "STIXGeneral")), size)
     columns = max(3, int((box[2] - box[0]) / (0.55 * size)))
@@ -130,7 +130,7 @@ def small_print(random: Generator, image: Image.Image, box: Box, fill: Colour) -
 
 
 def element(random: Generator, image: Image.Image, b: Brand, kind: str, box: Box) -> None:
-    """One element of `LAYOUTS`, in this box of pixels."""
+    """Draw one element of `LAYOUTS` in this box of pixels."""
     left, top, right, bottom = box
     draw, wide, high, middle = pen(image), right - left, bottom - top, ((left + right) / 2, (top + bottom) / 2)
     radius, below = min(wide, high) / 2, tx.colour_at(image, int(middle[0]), int(middle[1]))
@@ -160,7 +160,7 @@ def element(random: Generator, image: Image.Image, b: Brand, kind: str, box: Box
         tx.draw_picture(image, b.motif, *middle, radius, (b.accent, shade(b.second, 0.8), shade(b.base, 0.6)))
     elif kind == "picture":
         tx.picture(random, image, *middle, radius, below)
-    elif kind == "scene":  # the product by the heap
+    elif kind == "scene":  # a heap of the product
         part = Image.new("RGB", (max(1, int(wide)), max(1, int(high))), b.second)
         tx.heap(random, part, b.accent)
         image.paste(part, (int(left), int(top)))
@@ -181,7 +181,7 @@ def element(random: Generator, image: Image.Image, b: Brand, kind: str, box: Box
 
 
 def panel(random: Generator, b: Brand, role: str, wide: float, high: float, longest: int = 256) -> Image.Image:
-    """A printed face of these proportions, in one of the role's `LAYOUTS`; a narrow one reads along its length."""
+    """A printed face of these proportions, in one of the role's `LAYOUTS`; narrow faces read along their length."""
     width, height = (max(24, round(longest * side / max(wide, high))) for side in (wide, high))
     if height > 1.9 * width:
         return panel(random, b, role, high, wide, longest).transpose(Image.Transpose.ROTATE_90)
@@ -202,8 +202,8 @@ def panel(random: Generator, b: Brand, role: str, wide: float, high: float, long
 def four_sides(random: Generator, b: Brand, x: float, z: float, y: float, alike: bool = True) -> list[Image.Image]:
     """Prints for the sides of a package of this size: front, right, back, left.
 
-    They all differ; where they may be `alike`, sometimes front and back are, or right and left, but never both, and
-    only where the other two are wide enough to tell.
+    All sides differ. If they may be `alike`, sometimes front and back are, or right and left, but never both, and only
+    if the other two are wide enough to tell them apart.
     """
     roles = (("front", x), ("facts", z), ("back", x), ("story", z))
     front, right, back, left = (panel(random, b, role, width, y) for role, width in roles)

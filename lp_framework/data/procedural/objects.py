@@ -1,4 +1,4 @@
-"""The families of objects, the one object that a seed and an index stand for, and the choice `data=procedural`."""
+"""The families of objects, the object for a given seed and index, and the choice `data=procedural`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from lp_framework.registry import register
 
 @dataclass(frozen=True)
 class Family:
-    """Objects of one kind and one ambiguity class: what `build` makes of a generator, the class included, by
-    construction. `share` weighs it against the other families."""
+    """Objects of one kind, built from a generator by `build`, and one ambiguity class, which holds by construction.
+    `share` is the weight relative to other families."""
 
     name: str
     build: Callable[[Generator], Parts]
@@ -78,21 +78,21 @@ GOLDEN, SILVER = (5**0.5 - 1) / 2, 2**0.5 - 1
 
 
 def procedural_object(seed: int, index: int) -> MeshObject:
-    """Object `index` of the objects of `seed`, named after its family and both; the same whatever others there are."""
+    """Object `index` of `seed`, named after its family and both numbers; independent of the other objects."""
     family = family_of(seed, index)
     name = f"{family.name}_{seed}_{index:05d}"
     return MeshObject(name, family.ambiguity, partial(procedural_scene, seed, index), family.unique_answer)
 
 
 def family_of(seed: int, index: int) -> Family:
-    """The family of an object. By multiples of the golden ratio the families come evenly, however many objects."""
+    """The family of an object. Multiples of the golden ratio spread families evenly for any number of objects."""
     ends = np.cumsum([family.share for family in FAMILIES])
     place = (index * GOLDEN + seed * SILVER) % 1 * ends[-1]
     return FAMILIES[int(np.searchsorted(ends, place, side="right"))]
 
 
 def procedural_scene(seed: int, index: int) -> trimesh.Scene:
-    """The normalised scene of an object: half of them face +Z, the others any way; all in a light of their own."""
+    """The normalised scene of an object: half face +Z, the others a random direction; each has its own lighting."""
     random = np.random.default_rng([seed, index])
     parts = family_of(seed, index).build(random)
     heading = pick(random, (0.0, random.uniform(0, 360)))
@@ -102,7 +102,7 @@ def procedural_scene(seed: int, index: int) -> trimesh.Scene:
 
 @register("data", "procedural")
 class ProceduralData(RenderedData):
-    """Textured household objects without end, made by this package; those of another `objects_seed` are all others."""
+    """An unlimited supply of generated, textured household objects; each `objects_seed` gives different ones."""
 
     def __init__(
         self,
@@ -129,5 +129,5 @@ class ProceduralData(RenderedData):
         )  # fmt: skip
 
     def objects(self) -> list[MeshObject]:
-        """The first objects of the seed, named after their family, the seed and their number."""
+        """The first objects of the seed, named after their family, the seed and their index."""
         return [procedural_object(self.seed, index) for index in range(self.count)]

@@ -36,7 +36,7 @@ class Shape:
         return Shape(self.vertices + np.array([x, y, z]), self.uv, self.triangles)
 
     def turn(self, axis: str, degrees: float) -> Shape:
-        """The shape turned about a coordinate axis, counter-clockwise seen from its tip."""
+        """The shape rotated about a coordinate axis, counter-clockwise seen from its tip."""
         rotation = trimesh.transformations.rotation_matrix(np.radians(degrees), AXES[axis])[:3, :3]
         return Shape(self.vertices @ rotation.T, self.uv, self.triangles)
 
@@ -53,7 +53,7 @@ class Shape:
         )
 
     def paint(self, texture: Image.Image | Colour, light: Array | None = None) -> trimesh.Trimesh:
-        """The finished mesh, in a matt material of one colour or with a texture, times a `light` of three colours."""
+        """The finished mesh: a matte material of one colour or with a texture, times a `light` of three colours."""
         texture = plain(texture) if isinstance(texture, tuple) else texture
         tint = None if light is None else [*light, 1.0]
         material = PBRMaterial(baseColorTexture=texture, baseColorFactor=tint, metallicFactor=0.0, roughnessFactor=1.0)
@@ -90,7 +90,7 @@ def arc_length(points: Array) -> Array:
 
 
 def loft(rings: Array, closed: bool = False) -> Shape:
-    """A skin over rings `[M, N, 3]`: `u` goes evenly around a ring, `v` by length along the middle of the skin.
+    """A surface over rings `[M, N, 3]`: `u` goes evenly around a ring, `v` by length along the middle.
 
     The ends are capped with fans; `closed` joins the last ring to the first instead. Triangles face outward.
     """
@@ -118,7 +118,7 @@ def loft(rings: Array, closed: bool = False) -> Shape:
 
 
 def outward(shape: Shape) -> Shape:
-    """The closed shape facing outward, without the triangles that collapse where a ring shrinks to a point."""
+    """Orient the closed shape outward and remove triangles that collapse where a ring shrinks to a point."""
     a, b, c = np.moveaxis(shape.vertices[shape.triangles], 1, 0)
     kept = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12
     volume = np.einsum("fi,fi->", a, np.cross(b, c))
@@ -127,7 +127,7 @@ def outward(shape: Shape) -> Shape:
 
 
 def lathe(profile: ArrayLike, segments: int = 64, closed: bool = False) -> Shape:
-    """The surface that a profile `[M, 2]` of (radius, height) sweeps around +Y; `u` 0.5 faces +Z and grows to +X."""
+    """The surface that a profile `[M, 2]` of (radius, height) sweeps around +Y; `u` 0.5 faces +Z, going to +X."""
     radius, height = np.asarray(profile, dtype=np.float64).T
     angle = 2 * np.pi * (np.arange(segments) / segments - 0.5)
     ring = np.stack([np.sin(angle), np.zeros(segments), np.cos(angle)], axis=1)
@@ -147,7 +147,7 @@ def cylinder(radius: float, height: float, bevel: float = 0.0, segments: int = 4
 
 
 def plan(x: float, z: float, radius: float, y: float, count: int = 96) -> Array:
-    """A ring `[count, 3]` at height `y`: a rectangle with rounded corners, from the middle of its back over -X.
+    """A ring `[count, 3]` at height `y`: a rounded rectangle, from the middle of its back over -X.
 
     Its points are evenly spaced, so on a loft of such rings `u` is the length along the ring; 0.5 faces +Z.
     """
@@ -158,7 +158,7 @@ def plan(x: float, z: float, radius: float, y: float, count: int = 96) -> Array:
 
 
 def tube(path: ArrayLike, radius: ArrayLike, segments: int = 16, closed: bool = False) -> Shape:
-    """A round tube along points `[M, 3]`, with one radius or one per point; `u` goes around, `v` along."""
+    """A round tube along points `[M, 3]`, with a single radius or one per point; `u` goes around, `v` along."""
     points = np.asarray(path, dtype=np.float64)
     tangents = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0) if closed else np.gradient(points, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -166,7 +166,7 @@ def tube(path: ArrayLike, radius: ArrayLike, segments: int = 16, closed: bool = 
     angle = 2 * np.pi * np.arange(segments) / segments
     rings = []
     for point, tangent, r in zip(points, tangents, np.broadcast_to(radius, len(points)), strict=True):
-        side = side - tangent * (side @ tangent)  # the frame moves without twisting
+        side = side - tangent * (side @ tangent)  # transports the frame without twisting
         side /= np.linalg.norm(side)
         across = np.cross(tangent, side)
         rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * across))
@@ -215,7 +215,7 @@ def box(x: float, y: float, z: float, radius: float = 0.03, steps: int = 3) -> S
 
 
 def joined(shapes: Iterable[Shape]) -> Shape:
-    """Several shapes as one, to be painted with one texture."""
+    """Several shapes as one, to share one texture."""
     return reduce(operator.add, shapes)
 
 
@@ -245,7 +245,7 @@ def extrude(outline: ArrayLike, depth: float, bevel: float = 0.02) -> Shape:
         triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]], cap + count])
         vertices = np.concatenate([outer, inner])
         shapes.append(Shape(vertices, face(vertices, front), triangles if front else triangles[:, ::-1]))
-    # The rim has a quad for each edge, so that the strip's ends do not meet.
+    # The rim has a quad for each edge, so that the ends of the strip stay separate.
     corners = np.stack([rings[1], rings[1][there], rings[2][there], rings[2]], axis=1)
     length = arc_length(np.concatenate([points, points[:1]]))
     u = np.stack([length[:-1], length[1:], length[1:], length[:-1]], axis=1).ravel()
@@ -303,12 +303,12 @@ def wheel(radius: float, width: float) -> Shape:
 
 
 def both(shape: Shape) -> Shape:
-    """The shape and its copy half a turn further."""
+    """The shape and a copy rotated by half a turn."""
     return shape + shape.turn("y", 180)
 
 
 def hollow(outside: Array, wall: float) -> tuple[Array, float]:
-    """The profile of a vessel that is closed below, from that of its outside, and the outside's share of its length."""
+    """The profile of a vessel closed at the bottom, from its outer profile, and the outer fraction of its length."""
     inside = (outside - (wall, 0))[::-1]
     inside = inside[inside[:, 1] > outside[0, 1] + 3 * wall]
     profile = np.concatenate([[(0, outside[0, 1])], outside, inside, [(0, inside[-1, 1])]])

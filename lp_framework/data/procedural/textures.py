@@ -1,4 +1,4 @@
-"""What surfaces look like: random colours, patterns, materials, and pictures drawn by code."""
+"""Surface appearance: random colours, patterns, materials, and pictures drawn by code."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from lp_framework.data.procedural.solids import curve
 
 Choice = TypeVar("Choice")
 
-HUES = (0.0, 0.02, 0.06, 0.1, 0.14, 0.3, 0.38, 0.53, 0.58, 0.62, 0.66, 0.78, 0.93)  # more of those that sell
-TONES = {  # hues, ranges of saturation and value, share among the colours of things
+HUES = (0.0, 0.02, 0.06, 0.1, 0.14, 0.3, 0.38, 0.53, 0.58, 0.62, 0.66, 0.78, 0.93)  # denser among common hues
+TONES = {  # hues, ranges of saturation and value, and frequency
     "vivid": (HUES, (0.65, 1.0), (0.55, 1.0), 0.3),
     "pale": (HUES, (0.08, 0.4), (0.8, 1.0), 0.13),
     "deep": (HUES, (0.5, 1.0), (0.15, 0.45), 0.12),
@@ -25,7 +25,7 @@ TONES = {  # hues, ranges of saturation and value, share among the colours of th
     "white": ((0.05, 0.12), (0.0, 0.07), (0.86, 1.0), 0.15),
     "black": (HUES, (0.0, 0.25), (0.06, 0.16), 0.07),
 }
-# Strokes: what, in which of three colours, and points (x to the right, y up) of a square from -10 to 10.
+# Strokes: kind, index of one of three colours, and points (x right, y up) in a square from -10 to 10.
 PICTURES = {
     "fruit": "disc 0 0 -1 8 8, disc 2 -3 2 2 2, line 1 0 6 1 10, blob 1 1 8 5 10 8 7",
     "berries": "disc 0 -5 2 3 3, disc 0 0 3 3 3, disc 0 5 2 3 3, disc 0 3 -2 3 3, disc 0 0 -6 3 3, blob 1 0 5 -6 9 6 9",
@@ -47,7 +47,7 @@ PICTURES = {
 
 
 def pick(random: Generator, choices: Sequence[Choice], shares: Sequence[float] | None = None) -> Choice:
-    """One of the choices, evenly or by their shares."""
+    """Choose one of the choices, uniformly or by weight."""
     weights = None if shares is None else np.asarray(shares) / np.sum(shares)
     return choices[int(random.choice(len(choices), p=weights))]
 
@@ -58,7 +58,7 @@ def chance(random: Generator, probability: float) -> bool:
 
 
 def colour(random: Generator, *tones: str) -> Colour:
-    """A random colour of one of these `TONES`, by default of any."""
+    """A random colour from these `TONES`, by default from any."""
     names = tones or tuple(TONES)
     hues, saturation, value, _ = TONES[pick(random, names, [TONES[name][3] for name in names])]
     hue = (pick(random, hues) + random.normal(0, 0.015)) % 1
@@ -72,7 +72,7 @@ def colour_at(image: Image.Image, x: int = 0, y: int = 0) -> Colour:
 
 
 def contrast(first: Colour, second: Colour) -> float:
-    """Difference of the perceived brightness, 0 to 255.
+    """Difference in perceived brightness, 0 to 255.
 
     >>> round(contrast((0, 0, 0), (255, 255, 255)))
     255
@@ -81,7 +81,7 @@ def contrast(first: Colour, second: Colour) -> float:
 
 
 def ink(random: Generator, ground: Colour, *tones: str) -> Colour:
-    """A colour of one of the tones that stands out from the ground; if none is found soon, black or white."""
+    """A colour from the given tones that stands out from the ground; black or white if none is found quickly."""
     for _ in range(8):
         if contrast(found := colour(random, *tones), ground) > 80:
             return found
@@ -112,7 +112,7 @@ def pattern(random: Generator, image: Image.Image, paint: Colour) -> None:
 
 
 def heap(random: Generator, image: Image.Image, paint: Colour) -> None:
-    """A heap of rounded pieces in two colours, as pasta, beans or sweets."""
+    """Draw a heap of rounded pieces in two colours, like pasta, beans or sweets."""
     draw, paints = pen(image), (paint, paint, colour(random, "vivid", "brown", "pale"))
     long, short = max(image.size) * random.uniform(0.05, 0.14) * np.array((1, random.uniform(0.35, 1)))
     for x, y in random.random((110, 2)) * image.size:
@@ -123,7 +123,7 @@ def heap(random: Generator, image: Image.Image, paint: Colour) -> None:
 
 
 def ground(random: Generator, width: int, height: int, base: Colour, other: Colour, busy: float) -> Image.Image:
-    """An image of one colour, with a pattern of the other in `busy` of all cases."""
+    """An image of one colour, with a pattern of the other with probability `busy`."""
     image = Image.new("RGB", (width, height), base)
     if chance(random, busy):
         pattern(random, image, other)
@@ -131,7 +131,8 @@ def ground(random: Generator, width: int, height: int, base: Colour, other: Colo
 
 
 def material(random: Generator, *tones: str, grained: float = 0.0) -> Image.Image:
-    """A texture without a print, of one of the tones: wood in `grained` of all cases, else plain, mottled, speckled."""
+    """A texture without a print, in one of the tones: wood with probability `grained`, else plain, mottled,
+    speckled."""
     base, kind = colour(random, *tones), random.random()
     if chance(random, grained):
         return wood(colour(random, "brown"), 256, 256, int(random.integers(2**31)))
@@ -145,7 +146,7 @@ def material(random: Generator, *tones: str, grained: float = 0.0) -> Image.Imag
 
 
 def draw_picture(image: Image.Image, name: str, x: float, y: float, radius: float, colours: Sequence[Colour]) -> None:
-    """One of `PICTURES`, its middle at pixel `(x, y)`."""
+    """Draw one of `PICTURES`, centred at pixel `(x, y)`."""
     draw = pen(image)
     for stroke in PICTURES[name].split(", "):
         kind, which, *numbers = stroke.split()
@@ -154,7 +155,7 @@ def draw_picture(image: Image.Image, name: str, x: float, y: float, radius: floa
             (dx, dy), (width, height) = points
             draw.ellipse([x + dx - width, y - dy - height, x + dx + width, y - dy + height], fill=paint)
             continue
-        if kind == "blob":  # the smooth closed curve through the points
+        if kind == "blob":  # a smooth closed curve through the points
             points = curve(np.concatenate([points[-1:], points, points[:2]]), 10 * len(points) + 20)[10:-10]
         corners = [(x + dx, y - dy) for dx, dy in points]
         if kind == "line":
@@ -164,13 +165,13 @@ def draw_picture(image: Image.Image, name: str, x: float, y: float, radius: floa
 
 
 def picture(random: Generator, image: Image.Image, x: float, y: float, radius: float, against: Colour) -> None:
-    """A random picture, in colours of its own that stand out from the ground."""
+    """Draw a random picture in random colours that stand out from the ground."""
     colours = ink(random, against, "vivid", "deep", "pale"), colour(random, "vivid", "brown"), ink(random, against)
     draw_picture(image, pick(random, list(PICTURES)), x, y, radius, colours)
 
 
 def frieze(random: Generator, width: int, height: int, repeats: int, base: Colour) -> Image.Image:
-    """One motif `repeats` times side by side, exactly alike; `width` must be a multiple of `repeats`."""
+    """One motif repeated identically `repeats` times side by side; `width` must be a multiple of `repeats`."""
     tile = Image.new("RGB", (width // repeats, height), base)
     if chance(random, 0.5):
         pattern(random, tile, ink(random, base))

@@ -1,4 +1,4 @@
-"""All else about the house: books, tools, toys, appliances, shoes, bags, and shapes put together at random."""
+"""Other household objects: books, tools, toys, appliances, shoes, bags, and random combinations of shapes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lp_framework.data.procedural.textures import chance, colour, ground, ink, m
 
 
 def book(random: Generator) -> Parts:
-    """A book or a folder, lying or upright: printed or plain covers, a spine, and pages."""
+    """A book or folder, lying or upright: printed or plain covers, a spine, and pages."""
     wide, thick, w = *random.uniform((0.6, 0.08), (0.85, 0.35)), 0.025
     b, pages = brand(random), Image.new("RGB", (64, 64), colour(random, "white"))
     for k in range(0, 64, 4):
@@ -46,7 +46,7 @@ def book(random: Generator) -> Parts:
 
 
 def tool(random: Generator) -> Parts:
-    """A hammer, screwdriver, spanner or brush, lying."""
+    """A hammer, screwdriver, spanner or brush, lying down."""
     long, kind = random.uniform(0.5, 0.8), int(random.integers(4))
     steel, paint = material(random, "grey", "black", "brown"), material(random, "vivid", "brown", "black", grained=0.3)
     grip = body([(0.09, 0.07, 0), (0.13, 0.1, 0.1), (0.1, 0.08, 0.6 * long), (0.07, 0.06, long)], 2.4, 24, 3)
@@ -116,7 +116,7 @@ def vehicle(random: Generator) -> Parts:
 
 
 def appliance(random: Generator) -> Parts:
-    """A radio, oven, speaker, clock or telephone: a case with dials on its front, knobs, a grip, an aerial."""
+    """A radio, oven, speaker, clock or telephone: a case with dials on its front, knobs, a handle, an aerial."""
     x, y, z = random.uniform((0.5, 0.35, 0.2), (1, 0.8, 0.5))
     base, count = colour(random), int(random.integers(1, 5))
     accent, dial = ink(random, base), Image.new("RGB", (256, 256), base)
@@ -147,7 +147,7 @@ def appliance(random: Generator) -> Parts:
 
 
 def shoe(random: Generator) -> Parts:
-    """A shoe or a boot with its laces."""
+    """A shoe or boot with laces."""
     half = curve([(0, -0.5), (0.17, -0.42), (0.15, -0.1), (0.2, 0.25), (0.12, 0.47), (0, 0.5)], 20)
     outline = np.concatenate([half, half[-2:0:-1] * (-0.85, 1)])
     top = random.uniform(0.36, 0.7)
@@ -161,7 +161,7 @@ def shoe(random: Generator) -> Parts:
 
 
 def bag(random: Generator) -> Parts:
-    """A handbag, a shopping bag or a case: a printed body, two grips, a pocket on one side."""
+    """A handbag, shopping bag or case: a printed body, two handles, a pocket on one side."""
     x, y, z, grip = random.uniform((0.6, 0.5, 0.18, 0.14), (0.95, 0.9, 0.4, 0.25))
     b = brand(random)
     cloth = ground(random, 128, 128, b.base, b.second, 0.6)
@@ -175,7 +175,7 @@ def bag(random: Generator) -> Parts:
 
 
 def primitive(random: Generator) -> Shape:
-    """A simple shape, any way up: a block, drum, lump, ring, turned or tapering piece, bent pipe, or star."""
+    """A simple shape in any orientation: a block, drum, lump, ring, turned or tapering piece, bent pipe, or star."""
     a, b, c = random.uniform(0.15, 0.6, 3)
     kind, count = int(random.integers(8)), int(random.integers(3, 10))
     if kind == 0:
@@ -202,7 +202,7 @@ def primitive(random: Generator) -> Shape:
 
 
 def composition(random: Generator) -> Parts:
-    """Simple shapes stuck into one another, in a few paints and patterns; half of them are bent."""
+    """Intersecting simple shapes in a few paints and patterns; half of the compositions are bent."""
     patterned = [ground(random, 128, 128, colour(random), colour(random), 1.0) for _ in range(2)]
     paints = (*patterned, material(random), material(random), material(random))
     places = random.uniform(-0.25, 0.25, (int(random.integers(2, 7)), 3))

@@ -283,8 +283,8 @@ def crop(view: SphericalView, size: int) -> Image.Image:
     cut = photograph.colours()
     cut.putalpha(photograph.opacity())
     homography = real_cameras.crop_homography(photograph.camera, photograph.intrinsics, view.radius, size)
-    # Where the crop shrinks the photograph it is made larger first and then averaged, against aliasing: by how many
-    # pixels of the photograph one of the crop is wide, in its middle.
+    # Where the crop shrinks the photograph, render it larger first and then average to avoid aliasing: by the width,
+    # in pixels of the photograph, of the crop's central pixel.
     middle = torch.tensor([[size / 2, size / 2, 1.0], [size / 2 + 1, size / 2, 1.0]], dtype=torch.float64)
     seen = middle @ homography.mT
     larger = max(1, math.ceil((seen[1, :2] / seen[1, 2] - seen[0, :2] / seen[0, 2]).norm().item() - 0.05))
