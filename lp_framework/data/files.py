@@ -147,8 +147,7 @@ def content_key(files: Iterable[Path], *facts: object) -> str:
 
 @dataclass(frozen=True)
 class Origin:
-    """The source files of an object's views, files `beside` them that several objects may share, and their `up`
-    axis."""
+    """An object's source files, files `beside` them that several objects may share, and their `up` axis."""
 
     files: Sequence[Path]
     beside: Origin | None = None

@@ -45,9 +45,9 @@ class PairDataModule(LightningDataModule):
 
     `cache` is the folder of decoded views (square, `image_size` pixels a side). A training batch has about
     `batch_pairs` pairs over blocks of `block` views (see `BlockSampler`). To choose the best checkpoint,
-    `validation_views` of each object's training views are held out; or, with `validation_objects`, that many objects,
-    of each of which that many views are used. Test views are used only for evaluation; with `crop` they are prepared
-    like photographs, which loses the radius.
+    `validation_views` of each object's training views are held out; with `validation_objects`, that many whole objects
+    are held out instead, and `validation_views` of each are used. Test views are used only for evaluation; with `crop`
+    they are prepared like photographs, which loses the radius.
     """
 
     def __init__(
@@ -240,8 +240,7 @@ def _folder(split: str) -> str:
 
 
 def _answer(extractor: FeatureExtractor, size: int) -> list[str]:
-    """A coarse digest of the extractor's output for one image, which changes with its code and settings, not the
-    machine."""
+    """A coarse digest of the extractor's output for one image; changes with its code and settings, not the machine."""
     image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     with torch.inference_mode():
         features = extractor.trunk(image).float().flatten()

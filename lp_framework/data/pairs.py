@@ -29,14 +29,14 @@ class PairBatch:
 
     pixels: Tensor | None  # [I, H, W, 3] (uint8), or ...
     features: Tensor | None  # ... [I, ...] that a frozen backbone computed from them
-    names: list[str]  # names of the views, object/image
+    names: list[str]  # of the views, as object/image
     poses: Tensor  # [I, 3], view poses, and ...
     cameras: Tensor  # ... [I, 4, 4], the ground truth: float64, always on the CPU
     objects: Tensor  # [I]
     reference: Tensor  # [P], indices of views
     query: Tensor  # [P]
     pairs: Tensor  # [P, 2], the same as rows of the view table
-    points: Tensor | None = None  # [I, C^2, 3] (float16), seen in C x C cells, object's frame; NaN: nothing
+    points: Tensor | None = None  # [I, C^2, 3] (float16), 3-D points seen in C x C cells, object's frame; NaN: none
     cropped: Tensor | None = None  # [I], whether a view is a crop to the object, whose distance is unknown
     field_of_view: Tensor | None = None  # [I], radians (float64), on the CPU; None: unknown, all are crops
     relative: Tensor | None = None  # see `relative_poses`; set when the batch is moved to a device

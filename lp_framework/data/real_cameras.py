@@ -173,7 +173,7 @@ class ObjectFrame(NamedTuple):
 
 
 def fitting_views(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArray[np.float64]], points: Tensor) -> Tensor:
-    """Which views `[V]` (bool) have a silhouette that matches the points `[P, 3]` on the object's surface; the other
+    """Which views `[V]` (bool) have silhouettes that match the points `[P, 3]` on the object's surface; the other
     arguments are those of `frame_of_silhouettes`."""
     points = _some(points, PROJECTED)
     stray = torch.tensor([STRAY, 1 - STRAY]).to(points)
@@ -221,8 +221,8 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
     outline of its silhouette in each photograph.
 
     The centre is the point nearest to the lines of sight through the middles of the silhouettes. The height is the
-    median of the silhouettes' heights, both widths are their near-maximum width (90 % quantile), all at the centre's
-    distance. Raises `ValueError` if the cameras do not go around the object.
+    median of the silhouettes' heights; both widths are the 90 % quantile of their widths, nearly the largest; all at
+    the centre's distance. Raises `ValueError` if the cameras do not go around the object.
     """
     axes = _axes(cameras)
     outlines = map(torch.from_numpy, pixels)

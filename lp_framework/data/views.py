@@ -82,7 +82,7 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
     files, cameras = [], []
     for index, (file_path, matrix) in enumerate(frames):
         places = [folder / file_path for folder in (path.parent / "rgb", path.parent)]
-        files += [place for place in places if os.path.isfile(place)][:1]  # Path.is_file fails for an impossible name
+        files += [place for place in places if os.path.isfile(place)][:1]  # Path.is_file raises for an invalid name
         if len(files) == index:
             raise UserError(f"{path}: the image {file_path!r} is neither in rgb/ nor beside this file")
         with expecting(f"{path}: transform_matrix of frame {index} is not a 4 x 4 matrix of finite numbers"):

@@ -1,4 +1,4 @@
-"""Shared by the readers: finding the files that a mesh file refers to, as other viewers do, or warning of them."""
+"""Shared by the readers: finding the files that a mesh file refers to, as other viewers do, or warning if missing."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class MissingColourWarning(UserWarning, UserError):
 
 
 def warn(path: Path, what: str, category: type[UserWarning] = UserWarning) -> None:
-    """Warn of `what` in the mesh file `path` is not drawn as given."""
+    """Warn of `what` is not drawn as specified in the mesh file `path`."""
     warnings.warn(f"{path}: {what}", category, stacklevel=3)
 
 

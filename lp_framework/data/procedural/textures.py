@@ -131,8 +131,7 @@ def ground(random: Generator, width: int, height: int, base: Colour, other: Colo
 
 
 def material(random: Generator, *tones: str, grained: float = 0.0) -> Image.Image:
-    """A texture without a print, in one of the tones: wood with probability `grained`, else plain, mottled,
-    speckled."""
+    """A texture without print in one of the tones: wood with probability `grained`, else plain, mottled, speckled."""
     base, kind = colour(random, *tones), random.random()
     if chance(random, grained):
         return wood(colour(random, "brown"), 256, 256, int(random.integers(2**31)))

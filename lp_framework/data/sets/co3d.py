@@ -201,7 +201,7 @@ def _in_object_frame(photographs: list[Photograph], cloud: Path | None, scores: 
 
 
 def read_points(file: Path) -> Tensor:
-    """The points `[P, 3]` (float64) of a PLY file; `UserError` naming the file if it cannot be read or has under 3."""
+    """The points `[P, 3]` (float64) of a PLY file; `UserError` naming it if it is unreadable or has fewer than 3."""
     with expecting(f"{file}: does not load as a point cloud of three or more points"):
         loaded: Any = trimesh.load(file, process=False)
         if len(loaded.vertices) < 3:

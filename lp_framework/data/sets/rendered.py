@@ -1,6 +1,6 @@
 """Sources that render meshes: the embedded objects, folders of meshes, and scans as released by their authors.
 
-Of GSO and OmniObject3D the paper uses the 70 objects each that iFusion rendered, and 10 held-out ones of GSO. If
+Of GSO and OmniObject3D the paper uses the 70 objects each that iFusion rendered, and 10 more, held out, of GSO. If
 iFusion's renderings are available (`renderings`), the seen objects are theirs; otherwise they are drawn.
 """
 
