@@ -14,27 +14,27 @@ from typing import NoReturn
 from lp_framework.errors import UserError, among
 
 COMMANDS = {  # the module of a command is lp_framework.commands.NAME
-    "train": "Train a score or energy model of the relative pose, or a prior",
+    "train": "Train a score, energy or matching model of the relative pose, or a prior",
     "eval": "Estimate the poses of a data set's test views and report recall, success rate and errors",
-    "report": "Gather finished evaluations into tables and figures, beside the paper's numbers",
+    "report": "Collect finished evaluations in tables and figures, beside the paper's numbers",
     "estimate": "Estimate the camera poses of photographs of one object",
-    "views": "Draw novel views around an object by a prior",
-    "landscape": "Show a prior's energy over relative poses: of a pair of views, or around each object",
-    "figure": "Draw a figure of the paper of your own data, prior and models",
-    "app": "Try it in a browser: photographs, landscapes and finished runs",
+    "views": "Generate novel views around an object with a prior",
+    "landscape": "Show a prior's energy over relative poses: for a pair of views, or around each object",
+    "figure": "Draw a figure of the paper with your own data, prior and models",
+    "app": "Start the web app: photographs, landscapes and finished runs in a browser",
     "render": "Render meshes to views on disk",
-    "convert": "Turn a Zero123 checkpoint, or a training run, into a folder of safetensors that loads in seconds",
-    "bench": "Measure speed and memory against plain alternatives, side by side",
-    "plugins": "List every model, prior, solver, ... with its origin and its settings",
+    "convert": "Convert a Zero123 checkpoint or a training run into a folder of safetensors that loads in seconds",
+    "bench": "Measure speed and memory side by side with simple baselines",
+    "plugins": "List every model, prior, solver, ... with its origin and settings",
 }
 
 EXAMPLES = {
     "lp train": "train on the embedded objects",
-    "lp train model=energy trainer.max_epochs=5": "choose another model, change a setting",
-    "lp eval --multirun solver.gamma=0,0.3 start=ring,grid": "every combination, a folder each",
-    "lp train --help": "the settings of a command, and what can be chosen",
-    "lp train --cfg job": "the configuration, without running",
-    "lp plugins": "what can be chosen, in full",
+    "lp train model=energy trainer.max_epochs=5": "choose another model and change a setting",
+    "lp eval --multirun solver.gamma=0,0.3 start=ring,grid": "run every combination, each in its own folder",
+    "lp train --help": "show the settings and choices of a command",
+    "lp train --cfg job": "print the configuration without running",
+    "lp plugins": "list everything that can be chosen",
 }
 
 
@@ -90,4 +90,4 @@ def _print_overview() -> None:
     for title, rows in (("Commands", COMMANDS), ("Examples", EXAMPLES)):
         width = max(map(len, rows))
         print(f"{title}\n", *(f"  {left:{width}}  {right}" for left, right in rows.items()), "", sep="\n")
-    print("HYDRA_FULL_ERROR=1 shows the traceback of an error.")
+    print("Set HYDRA_FULL_ERROR=1 to see the traceback of an error.")

@@ -117,7 +117,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             except (UserError, errors.InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
                 if sweep and isinstance(error, Held):
-                    print(f"skipped, another command is at work on it: {relative(folder)}")
+                    print(f"skipped, another command is working on it: {relative(folder)}")
                     return
                 if not isinstance(error, Held):
                     remove_if_empty(folder, f"{job.job.name}.log")
@@ -299,7 +299,7 @@ def explain(error: Exception) -> str:
             as_list = "" if (registry.conf_dir() / key).is_dir() else f", or write a list, {key}=[{values}]"
             return f"'{override}' has several values: add --multirun to run each{as_list}"
         case OSError() if not isinstance(error, HydraException):
-            return f"the folder of this run cannot be made: {one_line(error)}"
+            return f"the folder of this run cannot be created: {one_line(error)}"
     return one_line(error) or type(error).__name__
 
 

@@ -218,7 +218,9 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
     for folder in (Path("plugins"), *named):
         plugins = _plugins(folder)
         if not plugins and folder in named:
-            raise UserError(f"plugins=[{folder}]: is no folder with Python files, nor holds one (below {Path.cwd()})")
+            raise UserError(
+                f"plugins=[{folder}]: is not a folder with Python files, and holds none (below {Path.cwd()})"
+            )
         for plugin in plugins:
             _load_plugin(plugin)
 
@@ -257,7 +259,7 @@ def _import(name: str, wanted: Path | None = None) -> None:
     """Import a module, which has to be that of the file `wanted`, and note the `conf/` folder beside it."""
     file = getattr(importlib.import_module(name), "__file__", None)
     if wanted is not None and (file is None or Path(file).resolve() != wanted):
-        raise ImportError(f"the name of its module '{name}' is taken by {file or 'another'}")
+        raise ImportError(f"the name of its module '{name}' is already used by {file or 'another'}")
     if file is not None and (conf := Path(file).parent / "conf").is_dir():
         _state.conf_folders.setdefault(conf, str(_state.loading))
 

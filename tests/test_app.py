@@ -269,7 +269,7 @@ def test_the_models_own_second_answer_goes_before_valleys() -> None:
     pair = ShownPair("a and b", "unlabelled", "", view, view, landscapes={PRIOR_ENERGY: relief(0.02)})
     second = Answer(0.0, math.pi, 0.31)
     assert warnings_of(Answer(0.0, 0.0, 0.6, second), pair) == [
-        "It may also be 180° round, probability 0.31 (about half a turn away: the back looks alike)."
+        "It may also be 180° round, probability 0.31 (about half a turn away: front and back look alike)."
     ]
     assert warnings_of(Answer(0.0, 0.0, 0.99), pair) == [second_valley(PRIOR_ENERGY, relief(0.02))]
 

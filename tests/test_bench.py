@@ -183,7 +183,7 @@ def test_seconds_are_those_of_one_step_of_all_starts(steps, monkeypatch):
     monkeypatch.setattr(harness, "timed", lambda work, device: (12.0, work()))
     measured = section()
     zero123.measure_step(measured, Computing("narrow"), [1, 2], rounds=1, steps=4)
-    assert measured.medians() == {"1 start, seconds a step": (3, 3), "2 starts, seconds a step": (3, 3)}
+    assert measured.medians() == {"1 start, seconds per step": (3, 3), "2 starts, seconds per step": (3, 3)}
 
 
 # ---------------------------------------------------------------- the loaders
@@ -370,7 +370,7 @@ def test_a_pair_is_encoded_once_here_and_at_every_step_of_the_loop(priors, monke
     assert ours == {"vae": [2] * 2, "clip": [2] * 2, "unet": [4] * 2 * 3}  # the first pair, and one more
     steps = 1 + 2 * 3  # to warm up, and of either start
     assert loop == {"vae": [2] * 2 * steps, "clip": [2] * steps, "unet": [2] * steps}
-    assert [*measured.rows] == ["2 starts, seconds a pair"] and "on an RTX 6000 Ada" in measured.note
+    assert [*measured.rows] == ["2 starts, seconds per pair"] and "on an RTX 6000 Ada" in measured.note
     assert "12.86 s from 2" in measured.note
 
 
@@ -392,7 +392,7 @@ def test_variants_by_name(words, settings):
 
 @pytest.mark.parametrize("words", ["", "bfloat8", "bfloat16 float16"])
 def test_variants_that_are_none(words):
-    with pytest.raises(UserError, match=f"precision.variants: '{words}' is none; give one or more of float32, bfl"):
+    with pytest.raises(UserError, match=f"precision.variants: '{words}' is not one; give one or more of float32, bfl"):
         variant(words, "narrow", None)
 
 
@@ -402,7 +402,7 @@ def test_the_layout_leaves_the_gradient_and_reduced_precision_nearly():
     zero123.measure_precision(measured, "narrow", variants, starts=2, rounds=1, steps=1, max_batch=None)
     off = {words: facts["gradient_deviation"] for words, facts in measured.facts.items()}
     assert list(off) == variants and off["channels_last"] < 1e-4 and 0 < off["bfloat16"] < 0.2
-    assert [*measured.rows] == [f"{words}: seconds a step" for words in off]
+    assert [*measured.rows] == [f"{words}: seconds per step" for words in off]
 
 
 # ---------------------------------------------------------------- the command
@@ -424,9 +424,9 @@ def test_a_run_that_is_stopped_keeps_what_it_has(lp, tmp_path, monkeypatch):
 
     monkeypatch.setattr(IFusion, "solve", stopped)
     ran = lp("bench", *overrides(), "hydra.run.dir=run")
-    assert ran.status == 130 and "1 start, seconds a step" in ran.out and "2 starts" not in ran.out
+    assert ran.status == 130 and "1 start, seconds per step" in ran.out and "2 starts" not in ran.out
     kept = json.loads((tmp_path / "run" / "bench.json").read_text())["second_stage"]
-    assert "2 starts, seconds a step" not in kept and kept["1 start, seconds a step"]["ratio"]
+    assert "2 starts, seconds per step" not in kept and kept["1 start, seconds per step"]["ratio"]
 
 
 def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
@@ -436,26 +436,26 @@ def test_every_measurement_is_in_the_table_and_in_the_file(tmp_path):
     assert ran.status == 0, ran.err
     kept = ran.json("bench.json")
     assert list(kept) == [*MEASUREMENTS, "device", "threads", "config", "versions"]
-    for row in ("pairs a second", "memory for backward, kB a pair"):
+    for row in ("pairs per second", "memory for backward, kB a pair"):
         one, other = (kept["loader"][row][name]["median"] for name in ("pairs in feature space", "plain pair loader"))
         assert kept["loader"][row]["ratio"] == pytest.approx(one / other)
     assert kept["loader"]["memory for backward, kB a pair"]["ratio"] < 1
-    assert ran.out.index("pairs a second") < ran.out.index("1 start, seconds a step")
-    assert "loader: images of 32 px, 36 pairs a batch" in ran.out
+    assert ran.out.index("pairs per second") < ran.out.index("1 start, seconds per step")
+    assert "loader: images of 32 px, 36 pairs per batch" in ran.out
     labels = {name: list(kept[name]) for name in MEASUREMENTS}
-    steps = [f"{count}, seconds a step" for count in ("1 start", "2 starts")]
+    steps = [f"{count}, seconds per step" for count in ("1 start", "2 starts")]
     assert labels["second_stage"] == [*steps, "encoding_seconds"]
-    assert "2 starts, seconds a step" in ran.out and "bench.json" in ran.out
+    assert "2 starts, seconds per step" in ran.out and "bench.json" in ran.out
     assert labels["encoding"] == [
-        f"pairs a second, {what}" for what in ("backbone", "prior", "training on a frozen backbone")
+        f"pairs per second, {what}" for what in ("backbone", "prior", "training on a frozen backbone")
     ]
-    assert labels["first_stage"] == ["1 pair, starts a second", "2 pairs of 2 images, starts a second"]
-    assert labels["rendering"] == ["raycast, views a second"]
-    assert labels["pair"] == ["1 start, seconds a pair", "first_pair_seconds"]
+    assert labels["first_stage"] == ["1 pair, starts per second", "2 pairs of 2 images, starts per second"]
+    assert labels["rendering"] == ["raycast, views per second"]
+    assert labels["pair"] == ["1 start, seconds per pair", "first_pair_seconds"]
     for gamma in ("gamma 0", "gamma 0.3"):
         facts = kept["adam_gauss_newton"][gamma]
         assert facts["energy"]["equal"] <= facts["energy"]["start"] and len(facts["energies"]["Adam"]) == 4
-        passes = kept["adam_gauss_newton"][f"{gamma} before, to equal energy: passes a start"]
+        passes = kept["adam_gauss_newton"][f"{gamma} before, to equal energy: passes per start"]
         assert passes["Gauss-Newton"]["median"] == 8 * (facts["steps"]["Gauss-Newton"] + 1)
         assert passes["Adam"]["median"] == 2 * facts["steps"]["Adam"]
 
@@ -473,7 +473,7 @@ def test_the_table_gives_ratios_of_the_first_to_the_second():
     [
         (
             "measure=[second_stag]",
-            "measure=second_stag is none of the measurements; did you mean 'second_stage'? (known: loa",
+            "measure=second_stag is not a measurement; did you mean 'second_stage'? (known: loa",
         ),
         (
             "second_stage.architecture=narow",
@@ -486,7 +486,7 @@ def test_the_table_gives_ratios_of_the_first_to_the_second():
         ("second_stage.starts=4", "second_stage.starts=4 does not fit; expected Sequence[int]"),
         (
             "measure=[rendering] rendering.object=duk",
-            "rendering.object=duk is none of the embedded objects; did you mean 'duck'?",
+            "rendering.object=duk is not one of the embedded objects; did you mean 'duck'?",
         ),
         (
             "measure=[precision] precision.architecture=tiny",

@@ -94,7 +94,7 @@ def test_another_number_of_rows_under_the_key_is_made_anew(array, tmp_path):
     array()
     wider = cached_array(tmp_path / "cache", "key", 2, lambda: [np.full((2, 9), 7, np.uint8)])
     assert wider.shape == (2, 9) and wider.dtype == np.uint8 and (wider == 7).all()
-    with pytest.raises(ValueError, match="the blocks of key have 2 rows, 3 are wanted"):
+    with pytest.raises(ValueError, match="the blocks of key have 2 rows, expected 3"):
         cached_array(tmp_path / "cache", "key", 3, lambda: [np.full((2, 9), 7, np.uint8)])
 
 

@@ -162,7 +162,7 @@ def test_a_folder_that_cannot_be_made_is_named(lp, walker, write, jobs, folder):
     sweep = ("--multirun", "solver.steps=1,2") if "sweep" in folder else ()
     finished = lp(*DEMO, folder, *sweep)
     assert finished.status == 2 and not jobs
-    assert finished.error.startswith("the folder of this run cannot be made: [Errno ")
+    assert finished.error.startswith("the folder of this run cannot be created: [Errno ")
 
 
 @pytest.mark.parametrize("command", ["train", "eval"])

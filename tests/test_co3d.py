@@ -169,7 +169,7 @@ def test_cameras_on_a_vertical_arc_do_not_tell_up(tmp_path):
     latitudes = torch.linspace(-0.5, 0.5, 6, dtype=torch.float64)
     cameras = camera_to_world(torch.stack([latitudes, torch.ones(6).double(), 3 * torch.ones(6).double()], dim=-1))
     outline = np.array([[90.0, 90.0], [110.0, 110.0], [90.0, 110.0]])
-    with pytest.raises(ValueError, match="do not go round the object"):
+    with pytest.raises(ValueError, match="do not go around the object"):
         frame_of_silhouettes(cameras, orbit(1)[0][1].expand(6, 3, 3), [outline] * 6)
 
 
@@ -284,7 +284,7 @@ def test_scenes_are_drawn_once_and_kept(tmp_path):
     assert CO3DData(str(root), **settings, objects=names).names() == names[::-1]
     with pytest.raises(UserError, match=rf"there is no 'bal-{SEQUENCE}' in .*did you mean 'ball-{SEQUENCE}'"):
         CO3DData(str(root), **settings, objects=[f"bal-{SEQUENCE}"]).names()
-    with pytest.raises(UserError, match="4 objects are there, 29 are needed"):
+    with pytest.raises(UserError, match="4 objects are there, but 29 are needed"):
         CO3DData(str(root), views=str(tmp_path / "others")).names()
 
 
@@ -368,7 +368,7 @@ CLOUD = Path("hydrant", SEQUENCE, "pointcloud.ply")
         ),
         (
             lambda root: Image.new("L", (10, 12)).save(root / "hydrant" / SEQUENCE / "masks/frame000002.png"),
-            r"frame000002\.png: is 10 x 12 pixels, the photograph should be 200 x 240",
+            r"frame000002\.png: is 10 x 12 pixels, but the photograph should be 200 x 240",
         ),
     ],
 )

@@ -76,7 +76,7 @@ def test_the_second_answer_is_the_most_probable_end_elsewhere():
             [(0, 10, 0.9), (20, 40, 0.4), (0, 180, 0.04), (0, 180, 0.04)],
         )
     )
-    assert half.second_words == "148° to the left, probability 0.31 (about half a turn away: the back looks alike)"
+    assert half.second_words == "148° to the left, probability 0.31 (about half a turn away: front and back look alike)"
     assert quarter.second_words == "80° to the right, probability 0.20"
     assert near.second is None and near.second_words == ""  # of the others one is too near, one not worth telling
     assert (half.words, half.verdict, near.verdict) == ("30° to the right", "doubtful", "trust")

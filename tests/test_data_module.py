@@ -461,7 +461,7 @@ def test_the_render_command_sees_another_mesh_under_the_name(mesh_data, meshes):
     mesh_data().prepare(check_meshes=True)
     mesh_data().prepare(check_meshes=True)
     (meshes / "brick.ply").replace(meshes / "cube.ply")
-    with pytest.raises(UserError, match=r"cube: the views in .* were rendered differently \(of another mesh"):
+    with pytest.raises(UserError, match=r"cube: the views in .* were rendered differently \(from another mesh"):
         mesh_data().prepare(check_meshes=True)
 
 

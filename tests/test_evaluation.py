@@ -372,7 +372,7 @@ def test_a_frozen_trunk_other_than_that_of_training_is_noticed(commands):
     stored(commands, "drawn.ckpt", lp_framework=recipe(commands, "backbone", draw=1))
     assert commands.here("x", "eval", "checkpoint=drawn.ckpt").error == (
         "drawn.ckpt: the frozen part of its backbone has other weights here than when the model was trained; "
-        "the pretrained weights of that time are wanted"
+        "use the same pretrained weights"
     )
 
 

@@ -414,7 +414,7 @@ def test_solvers_and_models_can_be_imported_without_optional_packages():
 
 def test_weights_of_a_matcher_that_cannot_be_had(tmp_path):
     pytest.importorskip("transformers")
-    with pytest.raises(UserError, match=f"{tmp_path}: the weights of efficientloftr cannot be had from there"):
+    with pytest.raises(UserError, match=f"{tmp_path}: the weights of efficientloftr cannot be loaded from there"):
         Features(matcher="efficientloftr", weights=str(tmp_path))
 
 

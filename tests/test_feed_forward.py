@@ -133,14 +133,14 @@ def test_weights_that_are_not_there(name, tmp_path):
     with pytest.raises(UserError, match=r"gone.pth: there is no such file with the weights of"):
         build(name, weights="gone.pth")
     with pytest.raises(
-        UserError, match=r"nobody/nothing: the weights of .* cannot be had from there .*identifier\); give"
+        UserError, match=r"nobody/nothing: the weights of .* cannot be loaded from there .*identifier\); give"
     ):
         build(name, weights="nobody/nothing")
 
 
 def test_weights_of_another_network(tmp_path):
     torch.save({"other": torch.ones(2)}, tmp_path / "other.pt")
-    with pytest.raises(UserError, match=r"other.pt: the weights of VGGT cannot be had from there"):
+    with pytest.raises(UserError, match=r"other.pt: the weights of VGGT cannot be loaded from there"):
         build("vggt", weights=str(tmp_path / "other.pt"))
 
 

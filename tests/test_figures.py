@@ -126,8 +126,8 @@ def test_pairs_are_the_views_that_were_asked_for(data):
     )
     torch.testing.assert_close(truths(shown), relative_pose(reference, query).float())
     for wrong, message in (
-        ((["cup"], [(0, 4)]), "object 'cup' has test views 0 to 3, there is no query 4"),
-        ((["cup"], [(1, 1)]), "reference and query must be two views, got 1 for both"),
+        ((["cup"], [(0, 4)]), "object 'cup' has test views 0 to 3; there is no query 4"),
+        ((["cup"], [(1, 1)]), "reference and query must be two different views, got 1 for both"),
         ((["cap"], [(0, 1)]), "no object 'cap'; did you mean 'cup'"),
     ):
         with pytest.raises(UserError, match=message):
@@ -343,7 +343,7 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
         ),
         (["figure=toy", "figure.energy=score"], "figure.energy=score: holds no energy model"),
         (["figure=cameras", "figure.score=energy"], "figure.score=energy: holds no score model"),
-        (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data have no object 'cap'; did you mean"),
+        (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data set has no object 'cap'; did you mean"),
         (["figure=recall", "figure.runs=none"], "runs=none: there is no such folder"),
         (["figure=recall", "figure.runs=score"], "no finished runs with several numbers of starts; `python -m lp_fr"),
         (
@@ -352,7 +352,7 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
         ),
         (["figure=landscapes", "figure.noises=0"], "noises must be a whole number, at least 1, got 0"),
         (["figure=landscapes", "figure.longitude_step_degrees=50"], "longitude_step_degrees must divide 360"),
-        (["figure=landscapes", "figure.objects=[]"], "figure.objects needs the name of an object"),
+        (["figure=landscapes", "figure.objects=[]"], "figure.objects needs the name of at least one object"),
         (["figure=trajectories", "figure.views=9"], "figure.views must be 2 to 5"),
         (["figure=cameras", "figure.methods=[ifuzion]"], "there is no solver 'ifuzion'; did you mean 'ifusion'"),
         (["figure=failures", "figure.views=1"], "figure.views must be 2 to 12"),

@@ -95,7 +95,7 @@ def test_a_download_is_left_alone_and_converted_once(make, root, tmp_path):
     assert content["left_out"] == {"occluded": 3} and content["largest_turn_degrees"] > 10
     make().prepare()
     assert record.stat().st_mtime_ns == stamp
-    with pytest.raises(UserError, match="holds other views than these files and settings make"):
+    with pytest.raises(UserError, match="holds views that were made from other files or settings"):
         make(train_views=4).prepare()
 
 
@@ -133,8 +133,8 @@ def test_metres_are_told_from_millimetres_by_the_masks(make, root, tmp_path, mod
         rewrite(folder / "scene_gt.json", scaled(pose, "cam_t_m2c"))
     with warnings.catch_warnings(record=True) as told:
         make().prepare()
-    taken = [str(each.message) for each in told if "taken are" in str(each.message)]
-    expected = [f"{root}: object 'obj_000001': taken are {units}, as its masks show"] if model != pose else []
+    taken = [str(each.message) for each in told if "assuming" in str(each.message)]
+    expected = [f"{root}: object 'obj_000001': assuming {units}, as its masks show"] if model != pose else []
     assert taken == expected
     assert json.loads((tmp_path / "views/obj_000001/conversion.json").read_text())["units"] == units
     for split, count in (("train", 5), ("test", 3)):
@@ -252,7 +252,7 @@ def entry(key: str, value):
         (lambda root: scene(root, "mask_visib/000000_000001.png").unlink(), "000001.png: there is no such file"),
         (
             lambda root: Image.new("L", (80, 60), 255).save(scene(root, "mask_visib/000000_000001.png")),
-            r"000000_000001\.png: is 80 x 60 pixels, the photograph should be 320 x 240",
+            r"000000_000001\.png: is 80 x 60 pixels, but the photograph should be 320 x 240",
         ),
         (
             lambda root: Image.new("L", SIZE).save(scene(root, "mask_visib/000000_000001.png")),
@@ -282,7 +282,7 @@ def test_objects_that_cannot_be_converted_are_listed_and_the_others_are_ready(ma
     write_scene(root / "val" / "000007", real_cameras(9, seed=5), object_id=4)
     (root / "val" / "000007" / "rgb" / "000003.png").unlink()
     lines = (
-        r"2 of 3 objects could not be converted; mend them, or take their names out of .*views/objects\.json:\n"
+        r"2 of 3 objects could not be converted; repair them, or remove their names from .*views/objects\.json:\n"
         r"  obj_000003: .*has 0 usable views.*\n  obj_000004: .*000003\.png: there is no such file"
     )
     for _ in range(2):

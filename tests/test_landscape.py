@@ -41,11 +41,14 @@ def test_the_papers_grid():
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"longitude_step_degrees": 11.0}, "longitude_step_degrees must divide 360 into three or more, got 11.0"),
-        ({"longitude_step_degrees": 180.0}, "longitude_step_degrees must divide 360 into three or more, got 180.0"),
-        ({"longitude_step_degrees": 0.0}, "longitude_step_degrees must divide 360 into three or more, got 0.0"),
-        ({"latitude_step_degrees": 70.0}, "latitudes need a limit between 0 and 180 degrees and a step up to it"),
-        ({"latitude_limit_degrees": 0.0}, "latitudes need a limit between 0 and 180 degrees and a step up to it"),
+        ({"longitude_step_degrees": 11.0}, "longitude_step_degrees must divide 360 into three or more parts, got 11.0"),
+        (
+            {"longitude_step_degrees": 180.0},
+            "longitude_step_degrees must divide 360 into three or more parts, got 180.0",
+        ),
+        ({"longitude_step_degrees": 0.0}, "longitude_step_degrees must divide 360 into three or more parts, got 0.0"),
+        ({"latitude_step_degrees": 70.0}, "latitudes need a limit between 0 and 180 degrees and a step no larger"),
+        ({"latitude_limit_degrees": 0.0}, "latitudes need a limit between 0 and 180 degrees and a step no larger"),
     ],
 )
 def test_grids_that_are_none(settings, sentence):

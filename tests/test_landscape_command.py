@@ -134,7 +134,7 @@ def test_the_overview_has_an_ambiguity_for_every_object(commands):
         assert score["verdict"] in ("unique", "twofold", "several", "continuous") and 0 <= score["flatness"] <= 1
         assert isinstance(score["unique_answer"], bool) and score["minima"] >= 1
         assert score["verdict"] in ran.out
-    assert "without a unique answer to this prior: " in ran.out or all(
+    assert "without a unique answer for this prior: " in ran.out or all(
         row["ambiguity_score"]["unique_answer"] for row in rows
     )
 
@@ -145,17 +145,17 @@ def test_the_overview_has_an_ambiguity_for_every_object(commands):
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        (["object=tran"], "the data have no object 'tran'; did you mean 'tram'?"),
-        (["object=tram", "query=4"], "object 'tram' has test views 0 to 3, there is no query 4"),
-        (["object=tram", "query=0"], "reference and query must be two views, got 0 for both"),
+        (["object=tran"], "the data set has no object 'tran'; did you mean 'tram'?"),
+        (["object=tram", "query=4"], "object 'tram' has test views 0 to 3; there is no query 4"),
+        (["object=tram", "query=0"], "reference and query must be two different views, got 0 for both"),
         (["object=tram", "query=last"], "query must be the number of a test view, got last"),
         (["object=tram", "images=[views,plugins]"], "give object=NAME for views of the data set or images="),
-        (["images=[views,views,views]"], "images: a landscape is of two files, got 3"),
+        (["images=[views,views,views]"], "images: a landscape needs two files, got 3"),
         (["images=[a.png,b.png]"], "images=a.png: there is no such file or folder"),
-        (["query=3"], "query is of the landscape of a pair; give object=NAME or images=[A.png,B.png], too"),
-        (["solver.steps=3"], "solver.steps is of the landscape of a pair; give object=NAME"),
+        (["query=3"], "query is for the landscape of a pair; also give object=NAME or images=[A.png,B.png]"),
+        (["solver.steps=3"], "solver.steps is for the landscape of a pair; also give object=NAME"),
         (["object=tram", "query=1", "longitude_step_degrees=50"], "longitude_step_degrees must divide 360"),
-        (["object=tram", "query=1", "timesteps=[]"], "timesteps must list whole numbers, one at least, got []"),
+        (["object=tram", "query=1", "timesteps=[]"], "timesteps must be a list of one or more whole numbers, got []"),
         (["object=tram", "query=1", "timesteps=[1000]"], "this prior has timesteps 0 to 999, got 1000"),
         (["object=tram", "query=1", "noises=0"], "noises must be a whole number, at least 1, got 0"),
         (["object=tram", "query=1", "batch=none"], "batch must be a whole number, at least 1, got none"),
@@ -164,7 +164,7 @@ def test_the_overview_has_an_ambiguity_for_every_object(commands):
             "latitude_step_degrees=few does not fit; expected float",
         ),
         (["azimuths=1"], "azimuths must be a whole number, at least 2, got 1"),
-        (["latitude_step_degrees=100"], "latitudes need a limit between 0 and 180 degrees and a step up to it"),
+        (["latitude_step_degrees=100"], "latitudes need a limit between 0 and 180 degrees and a step no larger"),
     ],
 )
 def test_mistakes(commands, settings, sentence):

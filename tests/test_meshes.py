@@ -136,7 +136,7 @@ def test_the_axis_that_points_up_can_be_chosen(tmp_path, suffix):
         (obj,) = MeshData(None, str(tmp_path), up=up).objects()
         with pytest.warns(UserWarning) as caught:
             np.testing.assert_allclose(obj.load().extents, extents, atol=1e-6)
-        said = [each for each in caught if "files of this format have +Y up, data.up=z is set" in str(each.message)]
+        said = [each for each in caught if "files of this format have +Y up, but data.up=z is set" in str(each.message)]
         assert len(said) == (suffix == "glb" and up == "z")
 
 

@@ -42,7 +42,7 @@ def test_numbers_and_other_words_of_yaml_are_names_as_they_are_written(file):
 
 
 def test_objects_that_are_left_out_are_named(file):
-    with pytest.warns(UserWarning, match=r"labels\.yaml: leaves out, so that they stay unlabelled: mug, vase$"):
+    with pytest.warns(UserWarning, match=r"labels\.yaml: has no label for mug, vase$"):
         assert read(file, "teapot: {ambiguity: unique}") == {"teapot": Label(ambiguity="unique")}
 
 

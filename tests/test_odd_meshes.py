@@ -269,23 +269,23 @@ def moved_by(**settings):
     ("write", "message"),
     [
         (faded, "not drawn of its materials: transparency"),
-        (material(emissiveFactor=[0, 1, 0]), "not drawn of its materials: light of their own"),
+        (material(emissiveFactor=[0, 1, 0]), "not drawn of its materials: emitted light"),
         (lambda folder: Gltf(uv=None).write(folder), "not drawn of its materials: textures (it has no coordinates"),
         (lambda folder: write_obj(folder, mtl="newmtl m\nd .5\nmap_Kd tex.png\n"), "of its materials: transparency"),
-        (lambda folder: write_obj(folder, mtl="newmtl m\nKe 0 1 0\nmap_Kd tex.png\n"), "materials: light of their own"),
+        (lambda folder: write_obj(folder, mtl="newmtl m\nKe 0 1 0\nmap_Kd tex.png\n"), "materials: emitted light"),
         (moved_by(skin=0), "its skeleton (skins) is left out"),
         (moved_by(weights=[0.0, 0.5]), "its morph targets are left out"),
-        (texture_uri("gone.png"), "its texture gone.png is not there or not a readable image"),
-        (only_ktx2, "its texture image/ktx2 is not there or not a readable image"),
-        (lambda folder: write_obj(folder, mtl="newmtl m\nmap_Kd gone.png\n"), "its texture gone.png is not there"),
-        (lambda folder: write_obj(folder, f"mtllib gone.mtl\n{SQUARE}"), "its material file gone.mtl is not there"),
-        (lambda folder: write_obj(folder, mtl="newmtl n\nKd 1 0 0\n"), "its material m is in none of its material fi"),
-        (broken_image, "its texture tex.png is not there or not a readable image"),
-        (ply_texture("comment TextureFile gone.png\n"), "its texture gone.png is not there"),
+        (texture_uri("gone.png"), "its texture gone.png is missing or not a readable image"),
+        (only_ktx2, "its texture image/ktx2 is missing or not a readable image"),
+        (lambda folder: write_obj(folder, mtl="newmtl m\nmap_Kd gone.png\n"), "its texture gone.png is missing"),
+        (lambda folder: write_obj(folder, f"mtllib gone.mtl\n{SQUARE}"), "its material file gone.mtl is missing"),
+        (lambda folder: write_obj(folder, mtl="newmtl n\nKd 1 0 0\n"), "its material m is not in any of its material"),
+        (broken_image, "its texture tex.png is missing or not a readable image"),
+        (ply_texture("comment TextureFile gone.png\n"), "its texture gone.png is missing"),
         (ply_texture(""), "1 of 1 meshes have no texture or colour"),
-        (OTHER["coordinates_that_are_not_numbers"], "1 of 2 triangles have no proper texture coordinates"),
-        (OTHER["coordinates_without_end"], "1 of 2 triangles have no proper texture coordinates"),
-        (OTHER["one_corner_nowhere"], "1 of 2 triangles have corners at infinity or nowhere"),
+        (OTHER["coordinates_that_are_not_numbers"], "1 of 2 triangles have no valid texture coordinates"),
+        (OTHER["coordinates_without_end"], "1 of 2 triangles have no valid texture coordinates"),
+        (OTHER["one_corner_nowhere"], "1 of 2 triangles have infinite or undefined"),
     ],
 )  # fmt: skip
 def test_what_is_not_drawn_is_named(write, message, tmp_path):
@@ -296,7 +296,7 @@ def test_what_is_not_drawn_is_named(write, message, tmp_path):
 
 def test_several_textures_of_a_ply_file_are_refused(tmp_path):
     path = ply_texture("comment TextureFile a.png\ncomment TextureFile b.png\n")(tmp_path)
-    with pytest.raises(UserError, match=f"^{path}: has 2 textures, one is read"):
+    with pytest.raises(UserError, match=f"^{path}: has 2 textures, but only one can be read"):
         load_scene(path)
 
 

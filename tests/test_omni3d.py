@@ -159,7 +159,7 @@ def alone(root: Path) -> None:
         (of_complex_numbers, r"poses/001\.npy: must be a 4 x 4 .*Cannot cast"),
         (scaled, r"poses/001\.npy: its camera is not a rigid camera-to-world transform"),
         (y_up, r"poses/001\.npy: its camera does not look at the origin with \+Z up"),
-        (at_the_centre, r"poses/001\.npy: its camera must stand off the origin"),
+        (at_the_centre, r"poses/001\.npy: its camera must not be at the origin"),
         (alone, r"dinosaur_002/poses: two or more poses \(\*\.npy\) are needed, 1 are there"),
     ],
 )

@@ -62,10 +62,10 @@ def test_views_of_another_download_of_the_same_name_are_not_taken(converted, tmp
         content = bytearray((other / name).read_bytes())
         content[-1] ^= 1
         (other / name).write_bytes(content)
-        with pytest.raises(UserError, match="holds other views than these files and settings make"):
+        with pytest.raises(UserError, match="holds views that were made from other files or settings"):
             prepare(other)
         (other / name).unlink()
-        with pytest.raises(UserError, match=r"holds other views|there is no such|has no|looked for"):
+        with pytest.raises(UserError, match=r"holds views that were made|there is no such|has no|looked for"):
             prepare(other)
     assert record.read_bytes() == before
 

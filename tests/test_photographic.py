@@ -93,7 +93,7 @@ def test_renderings_of_other_cameras_depths_and_sizes_are_decoded_anew(box, tmp_
 def test_views_without_depth_are_named(box, tmp_path):
     views = read_views(box, "box", "train")
     (box / "box" / "train" / "depth" / "002.png").rename(tmp_path / "002.png")
-    with pytest.raises(UserError, match=r"002\.png: there is no such file; views rendered with data\.depth=true have"):
+    with pytest.raises(UserError, match=r"002\.png: there is no such file; render the views with data\.depth=true"):
         decoded_renderings([views], 0.5, SIZE, tmp_path)
     (tmp_path / "002.png").rename(box / "box" / "train" / "depth" / "002.png")
 

@@ -108,7 +108,7 @@ def test_without_crop_an_image_without_background_is_taken_whole():
     opaque = image.copy()
     opaque.putalpha(255)
     assert np.array_equal(prepare(opaque, "a", crop=False), prepared)
-    with pytest.raises(UserError, match="a: is 64 x 32 pixels; without crop an image must be square"):
+    with pytest.raises(UserError, match="a: is 64 x 32 pixels; with crop=false an image must be square"):
         prepare(image.crop((0, 0, 64, 32)), "a", crop=False)
 
 
@@ -174,7 +174,7 @@ def test_the_labels_of_several_parts_are_the_object(numbers: tuple[int, ...], dt
     levels = labelled(*numbers)
     photograph = Image.new("RGB", (300, 200), (90, 120, 40))
     expected = prepare(photograph, "a", Image.fromarray(levels > 0))
-    with pytest.warns(UserWarning, match=rf"a: its mask has {len(numbers)} labels; all are taken for the object"):
+    with pytest.warns(UserWarning, match=rf"a: its mask has {len(numbers)} labels; all of them count as the object"):
         assert np.array_equal(prepare(photograph, "a", Image.fromarray(levels.astype(dtype))), expected)
     palette = Image.fromarray(np.unique(levels, return_inverse=True)[1].astype(np.uint8).reshape(200, 300))
     palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0] + [0] * 756)  # of DAVIS and VOC
@@ -203,7 +203,7 @@ def test_a_picture_is_no_mask():
 
 def test_what_is_said_of_a_mask_without_object_is_true():
     photograph, levels = Image.new("RGB", (300, 200)), np.asarray(placed(drawn(120, 80), 20, 30))[..., 3]
-    with pytest.raises(UserError, match="a: nothing in its mask is at least half opaque, at most 40%"):
+    with pytest.raises(UserError, match=r"a: none of its mask is at least half opaque \(at most 40%\)"):
         prepare(photograph, "a", Image.fromarray((levels * 0.4).astype(np.uint8)))
     for everywhere in (1, 100, 255):
         with pytest.raises(UserError, match="a: its mask marks no background, which must be black"):
@@ -228,7 +228,7 @@ def test_stray_pixels_far_from_the_object_are_left_out(size: tuple[int, int]):
             mask = None if mask is None else Image.fromarray(mask)
             assert np.array_equal(prepare(Image.fromarray(image), "a", mask), expected)
         assert message in [str(each.message) for each in told]
-    separate = "a: its mask has 2 separate parts, which are all taken for the object"
+    separate = "a: its mask has 2 separate parts, all of which count as the object"
     assert (size == (300, 200)) == (separate in [str(each.message) for each in told])  # in the other the gap is thin
 
 
@@ -406,13 +406,13 @@ def test_files_that_are_no_images(tmp_path: Path):
 def test_objects_that_are_not_there():
     image = Image.new("RGB", (60, 40))
     black = Image.new("RGB", (60, 40))
-    with pytest.raises(UserError, match="a: its mask is empty, nothing in it is at least half opaque"):
+    with pytest.raises(UserError, match="a: its mask is empty: none of it is at least half opaque"):
         prepare(image, "a", black)
     with pytest.raises(UserError, match="a: its mask is empty"):
         prepare(Image.new("RGBA", (60, 40)), "a")
     small = black.copy()
     small.paste("white", (10, 10, 25, 12))
-    with pytest.raises(UserError, match="a: the object is 15 pixels long, at least 16 are needed"):
+    with pytest.raises(UserError, match="a: the object is 15 pixels long, but at least 16 are needed"):
         prepare(image, "a", small)
     small.paste("white", (10, 10, 26, 12))
     prepare(image, "a", small)
@@ -476,7 +476,7 @@ def test_too_few_photographs(tmp_path: Path):
         (["a.png"], r"images=\['a\.png'\]: two or more are needed, got 1; give a list or a folder"),
         (tmp_path, rf"images={tmp_path}: two or more are needed, got 1; .*\(\.bmp, "),
         (tmp_path / "none", "none: there is no such folder; give a list"),
-        (str(tmp_path / "a.png"), "a.png: is one image, two or more are needed"),
+        (str(tmp_path / "a.png"), "a.png: is one image, but two or more are needed"),
     ):
         with pytest.raises(UserError, match=error):
             photograph_files(images)
@@ -504,13 +504,13 @@ def test_a_photograph_that_lacks_a_mask_others_have_is_named(rembg, tmp_path: Pa
     a = saved(placed(drawn(), 20, 30).convert("RGB"), tmp_path / "a.png")
     b = saved(placed(drawn(), 20, 30), tmp_path / "b.png")
     c = saved(Image.new("RGB", (40, 40)), tmp_path / "c.png")
-    lacking = r"b\.png: has no mask; looked for .*masks/b\.png \(.*\), found a\.png; its alpha channel is taken"
+    lacking = r"b\.png: has no mask; looked for .*masks/b\.png \(.*\), found a\.png; its alpha channel is used"
     with pytest.warns(UserWarning, match=lacking):
         read = read_photographs([a, b], tmp_path / "masks", remove_background=False, crop=True)
     assert [each.mask is None for each in read] == [False, True]
     with pytest.raises(UserError, match=r"c\.png: has no mask; looked for .*masks/c\.png \(.*\), found a\.png$"):
         read_photographs([a, c], tmp_path / "masks", remove_background=False, crop=True)
-    with pytest.warns(UserWarning, match="c.png: has no mask; .*; its whole picture is taken"):
+    with pytest.warns(UserWarning, match="c.png: has no mask; .*; its whole picture is used"):
         read_photographs([a, c], tmp_path / "masks", remove_background=False, crop=False)
 
 
@@ -549,7 +549,7 @@ def test_masks_of_nerfstudio_are_found_beside_the_images(tmp_path: Path, caplog)
     assert mask_beside(plain) == masks[0]
     read = read_photographs([plain, transparent], None, remove_background=False, crop=True)
     assert [each.mask is None for each in read] == [False, True]
-    assert "masks that lie beside the photographs are taken: frame_1.png" in caplog.messages
+    assert "using the masks beside the photographs: frame_1.png" in caplog.messages
     saved(cut.getchannel("A"), tmp_path / "images" / "frame_1_mask.png")
     saved(cut.getchannel("A"), tmp_path / "images" / "frame_1.mask.png")
     with pytest.raises(UserError, match=r"frame_1\.mask\.png and .*frame_1_mask\.png are both masks of .*frame_1\.jpg"):
@@ -614,7 +614,7 @@ def test_the_background_is_removed_where_nothing_else_tells(rembg):
 
 
 def test_what_can_go_wrong_with_background_removal(rembg, monkeypatch: pytest.MonkeyPatch):
-    with pytest.raises(UserError, match="a: rembg finds no background in it; give a mask"):
+    with pytest.raises(UserError, match="a: rembg found no background in it; give a mask"):
         prepare(Image.new("RGB", (60, 40), "white"), "a", remove_background=True)
     with pytest.raises(UserError, match="a: its mask is empty"):
         prepare(Image.new("RGB", (60, 40)), "a", remove_background=True)
@@ -642,13 +642,13 @@ def test_without_rembg_or_its_weights_a_rough_mask_is_made_and_said_once(rembg, 
         assert (mask & shown).sum() > 0.97 * (mask | shown).sum()
         assert np.array_equal(photograph.prepared(True).image, prepare(image, "a", remove_background=True))
     (said,) = caplog.messages
-    assert "GrabCut, since rembg cannot get its weights (no route to host); an alpha channel, masks=FOLDER" in said
+    assert "GrabCut, because rembg cannot get its weights (no route to host); an alpha channel, masks=FOLDER" in said
 
     monkeypatch.setitem(sys.modules, "rembg", None)  # as if not installed
     mask_maker.cache_clear()
     caplog.clear()
     assert prepare(image, "a", remove_background=True).getpixel((0, 0))[3] == 0
-    assert "since rembg is not installed (pip install 'lp_framework[masks]')" in caplog.text
+    assert "because rembg is not installed (pip install 'lp_framework[masks]')" in caplog.text
 
 
 def test_masks_are_not_made_where_there_are_any(rembg, tmp_path: Path):
@@ -656,7 +656,7 @@ def test_masks_are_not_made_where_there_are_any(rembg, tmp_path: Path):
     plain = saved(placed(drawn(), 20, 30).convert("RGB"), tmp_path / "b.png")
     (tmp_path / "masks").mkdir()
     saved(placed(drawn(), 20, 30).getchannel("A"), tmp_path / "masks" / "b.png")
-    with pytest.warns(UserWarning, match=r"a\.png: has no mask; .*; its alpha channel is taken"):
+    with pytest.warns(UserWarning, match=r"a\.png: has no mask; .*; its alpha channel is used"):
         read = read_photographs([cut, plain], tmp_path / "masks", remove_background=True, crop=True)
     assert [each.made for each in read] == [False, False] and rembg.sessions == []
 
@@ -665,7 +665,7 @@ def test_masks_are_not_made_where_there_are_any(rembg, tmp_path: Path):
 def test_a_picture_of_one_colour_has_no_rough_mask(rembg, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]):
     monkeypatch.setitem(sys.modules, "rembg", None)
     mask_maker.cache_clear()
-    with pytest.raises(UserError, match=r"a: (its mask is empty|GrabCut finds no background|the object is 1 pixels)"):
+    with pytest.raises(UserError, match=r"a: (its mask is empty|GrabCut found no background|the object is 1 pixels)"):
         prepare(Image.new("RGB", size, (90, 120, 40)), "a", remove_background=True)
 
 
@@ -675,14 +675,14 @@ def test_an_object_that_the_border_cuts_off_is_told(caplog):
     assert caplog.messages == []  # it touches the border
     prepare(cut, "cut.png")
     assert caplog.messages == [
-        "cut.png: the image's border seems to cut the object off; an answer wants all of it in the picture"
+        "cut.png: the image border seems to cut off the object; all of it should be in the picture"
     ]
 
 
 def test_a_mask_that_is_inverted_is_told(caplog):
     mask = placed(drawn(80, 60), 20, 40).getchannel("A").point(lambda level: 255 - level)
     prepare(Image.new("RGB", mask.size), "a", mask)
-    assert caplog.messages == ["a: all of the image's border is the object's; a mask is white where the object is"]
+    assert caplog.messages == ["a: the whole image border counts as the object; a mask must be white on the object"]
 
 
 # ---------------------------------------------------------------- cut-outs as they are published

@@ -91,7 +91,7 @@ def test_classes_of_a_plugin_can_be_pickled_for_worker_processes(here, write):
 @pytest.mark.parametrize("folder", ["nowhere", "empty"])
 def test_a_folder_that_does_not_exist_or_holds_nothing_is_told(here, folder):
     (here / "empty").mkdir()
-    with pytest.raises(UserError, match=rf"plugins=\[{folder}\]: is no folder with Python files, nor holds one"):
+    with pytest.raises(UserError, match=rf"plugins=\[{folder}\]: is not a folder with Python files, and holds none"):
         registry.discover([folder])
 
 
@@ -125,7 +125,7 @@ def test_a_plugin_whose_module_has_the_name_of_another_is_named(here, write):
     assert "first" in registry.names("start") and "second" not in registry.names("start")
     failures = registry.failures()
     assert set(failures) == {"folder plugins/json", "folder plugins/y"}
-    assert "the name of its module 'tmp_same' is taken by" in failures["folder plugins/y"]
+    assert "the name of its module 'tmp_same' is already used by" in failures["folder plugins/y"]
 
 
 def test_a_project_without_a_module_is_named(here, write):

@@ -92,7 +92,7 @@ def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands, whole)
     assert 0 < len(solved) < whole.json()["pairs"]
     ran = commands.here("unused", "eval", "resume=killed", "trainer.devices=1", "trainer.strategy=auto")
     assert ran.status == 0, ran.err
-    assert f"going on: {len(solved)} pairs have been solved before" in ran.out
+    assert f"resuming: {len(solved)} pairs are already solved" in ran.out
     ran.folder = commands.folder / "killed"
     assert_the_same(ran, whole)
 
@@ -112,7 +112,7 @@ def test_an_evaluation_of_sets_that_one_process_began_is_gone_on_with_by_two(com
         patch.setattr(Evaluation, "test_step", until)
         commands.here("sets_two", "eval", *settings)
     two = two_processes(commands, "sets_two", "eval", *settings)  # three batches are left for both
-    assert "going on: 24 pairs have been solved before" in two.out
+    assert "resuming: 24 pairs are already solved" in two.out
     assert_the_same(two, whole)
 
 

@@ -464,7 +464,7 @@ def test_finished_objects_are_believed_without_their_meshes_where_that_is_asked_
 def test_a_folder_without_its_record_is_not_believed(tmp_path, damage):
     render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
     damage(tmp_path / "cube")
-    with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no proper render\.json\)"):
+    with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no valid render\.json\)"):
         render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1, check_meshes=False)
 
 
@@ -511,7 +511,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
     ):
         render_object(obj, tmp_path, finer, FlatRenderer())
     other = MeshObject("cube", "unique", lambda: trimesh.Scene(vertex_coloured_torus()))
-    with pytest.raises(UserError, match=r"rendered differently \(of another mesh, .*; choose another folder"):
+    with pytest.raises(UserError, match=r"rendered differently \(from another mesh, .*; choose another folder"):
         render_object(other, tmp_path, SMALL, FlatRenderer())
     render_object(obj, tmp_path, SMALL, FlatRenderer(fails_at=0))
 
@@ -519,7 +519,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     (tmp_path / "cube").mkdir()
     (tmp_path / "cube" / "thesis.txt").write_text("precious")
-    with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no proper render\.json\)"):
+    with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no valid render\.json\)"):
         render_object(*objects_named("cube"), tmp_path, SMALL, FlatRenderer())
     assert contents(tmp_path) == {"cube/thesis.txt": b"precious"}
 
@@ -550,7 +550,7 @@ def test_records_are_as_they_were_before_later_settings_came(tmp_path):
 
 def test_depths_are_kept_where_they_are_asked_for(tmp_path):
     protocol = replace(SMALL, depth=True)
-    with pytest.raises(UserError, match=r"renderer=flat knows no depth; set data\.depth=false"):
+    with pytest.raises(UserError, match=r"renderer=flat does not provide depth; set data\.depth=false"):
         render_objects(objects_named("cube"), tmp_path / "flat", protocol, FlatRenderer(), workers=1)
     (cube,) = objects_named("cube")
     render_objects([cube], tmp_path, protocol, RaycastRenderer(), workers=1)
@@ -632,7 +632,7 @@ def test_views_of_other_meshes_of_the_same_names_are_not_taken(coloured, tmp_pat
     assert [seen_colour(views, name) for name in ("ply", "obj")] == [[True, False, False]] * 2
     before = contents(views)
     with pytest.raises(
-        UserError, match=rf"2 of 2 .*: obj, ply: the views in {views} were rendered differently \(of another mesh"
+        UserError, match=rf"2 of 2 .*: obj, ply: the views in {views} were rendered differently \(from another mesh"
     ):
         views_of(blue, views)
     assert contents(views) == before
@@ -651,7 +651,7 @@ def test_a_mended_mesh_or_material_is_noticed(coloured, tmp_path, file, name):
     (red / file).write_bytes(mended.read_bytes())
     os.utime(red / file, ns=(times.st_atime_ns, times.st_mtime_ns))  # a mend that keeps size and time
     with pytest.raises(
-        UserError, match=rf"1 of . objects could not be rendered: {name}: the views in .* \(of another mesh"
+        UserError, match=rf"1 of . objects could not be rendered: {name}: the views in .* \(from another mesh"
     ):
         views_of(red, views)
     shutil.rmtree(views / name)
@@ -662,7 +662,7 @@ def test_meshes_with_another_axis_up_are_other_views(coloured, tmp_path):
     red = coloured("red", (255, 0, 0))
     data = views_of(red, tmp_path / "views")
     data.up = "z"
-    with pytest.raises(UserError, match=r"rendered differently \(of another mesh"):
+    with pytest.raises(UserError, match=r"rendered differently \(from another mesh"):
         data.prepare()
 
 
@@ -700,7 +700,7 @@ def test_a_file_of_labels_holds_for_all_objects_whatever_their_views_were_render
         return [data.views(name, "test").ambiguity for name in ("ply", "obj")]
 
     assert ambiguities("ply: {ambiguity: unique}\nobj: {ambiguity: twofold}") == ["unique", "twofold"]
-    with pytest.warns(UserWarning, match="so that they stay unlabelled: obj"):
+    with pytest.warns(UserWarning, match="has no label for obj"):
         assert ambiguities("ply: {ambiguity: continuous}") == ["continuous", "unlabelled"]
 
 

@@ -255,9 +255,7 @@ def test_results_do_not_outlive_the_beginning_of_others(commands, whole, stop):
 def test_another_configuration_is_refused_in_a_sentence_and_nothing_is_lost(commands, stop):
     folder = stop("mixed", 2)
     before = journal(folder).read_bytes()
-    expected = (
-        "mixed: holds an unfinished evaluation of something else ({}); give another folder, or remove mixed/unfinished"
-    )
+    expected = "mixed: holds another unfinished evaluation ({}); give another folder, or remove mixed/unfinished"
     wrong = commands.here("mixed", "eval", *EVALUATION, "solver.gamma=0.2", "seed=3")
     assert wrong.error == expected.format("seed is 0 there, 3 here, solver.gamma is [0.0, 0.3, 0.0] there, 0.2 here")
     os.makedirs(commands.folder / "copy", exist_ok=True)
@@ -278,8 +276,10 @@ def test_a_model_that_was_trained_anew_is_refused(commands, stop):
     content["state_dict"][bias] += 1
     torch.save(content, checkpoint)
     try:
-        assert "of something else (other weights)" in commands.here("retrained", "eval", *EVALUATION).error
-        assert "of something else (other weights)" in commands.here("unused", "eval", "resume=retrained").error
+        assert "another unfinished evaluation (other weights)" in commands.here("retrained", "eval", *EVALUATION).error
+        assert (
+            "another unfinished evaluation (other weights)" in commands.here("unused", "eval", "resume=retrained").error
+        )
     finally:
         checkpoint.write_bytes(kept)
 
@@ -292,7 +292,7 @@ def test_views_that_have_changed_are_refused(commands, stop):
     content["ambiguity"] = "twofold"
     transforms.write_text(json.dumps(content))
     try:
-        assert "redrawn: holds an unfinished evaluation of something else (other views)" in (
+        assert "redrawn: holds another unfinished evaluation (other views)" in (
             commands.here("redrawn", "eval", *EVALUATION).error
         )
     finally:
@@ -308,14 +308,14 @@ def test_an_evaluation_that_has_solved_nothing_is_in_nobodys_way(commands, stop)
 
 def test_what_cannot_be_resumed_is_named(commands, whole, stop):
     assert commands.here("unused", "eval", "resume=whole").error == (
-        "resume=whole: that run is finished, whole/results.json has its results"
+        "resume=whole: that run is finished; its results are in whole/results.json"
     )
     assert commands.here("unused", "eval", "resume=score").error == (
-        "resume=score: holds no unfinished evaluation to go on from; give the folder of one"
+        "resume=score: holds no unfinished evaluation to resume; give the folder of one"
     )
     stop("kept", 1)
     assert commands.here("unused", "eval", "resume=kept", "solver.gamma=0").error == (
-        "solver.gamma cannot be changed by a resumed run: kept/unfinished says what it is; leave it out"
+        "solver.gamma cannot be changed in a resumed run; leave it out (kept/unfinished has its value)"
     )
     assert commands.here("unused", "eval", "resume=kept", "trainer.devices=1").status == 0
 

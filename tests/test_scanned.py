@@ -84,7 +84,7 @@ def test_bad_downloads(tmp_path):
         gso(tmp_path / "nowhere").names()
     with pytest.raises(UserError, match=r"holds no objects of GSO; looked for .*\*/meshes/model\.obj"):
         gso(root / "Object_0").names()
-    with pytest.raises(UserError, match="9 objects are there, 80 are needed"):
+    with pytest.raises(UserError, match="9 objects are there, but 80 are needed"):
         gso(root, seen=70, unseen=10).names()
     with pytest.raises(UserError, match=r"looked for .*\*/\*/Scan/Scan\.obj"):
         OO3DData(None, str(root), views=str(tmp_path / "views")).names()
@@ -97,7 +97,7 @@ def test_damaged_objects(tmp_path):
     (root / GSO[0] / "materials" / "textures" / "texture.png").unlink()
     (root / GSO[1] / "meshes" / "model.obj").write_text("nothing\n")
     (root / GSO[2] / "meshes" / "model.obj").unlink()
-    messages = ["its texture texture.png is not there", "model.obj: ", "model.obj: there is no"]
+    messages = ["its texture texture.png is missing", "model.obj: ", "model.obj: there is no"]
     for name, message in zip(GSO, messages, strict=False):
         with pytest.raises(UserError, match=message):
             load_scan(root / name / "meshes" / "model.obj", "z")
@@ -106,9 +106,9 @@ def test_damaged_objects(tmp_path):
 @pytest.mark.parametrize(
     ("write", "data", "missing", "message"),
     [
-        (write_gso, GSOData, "meshes/model.mtl", "model.obj: its material file model.mtl is not there"),
-        (write_oo3d, OO3DData, "Scan/Scan.mtl", "Scan.obj: its material file Scan.mtl is not there"),
-        (write_oo3d, OO3DData, "Scan/Scan.jpg", "Scan.obj: its texture Scan.jpg is not there"),
+        (write_gso, GSOData, "meshes/model.mtl", "model.obj: its material file model.mtl is missing"),
+        (write_oo3d, OO3DData, "Scan/Scan.mtl", "Scan.obj: its material file Scan.mtl is missing"),
+        (write_oo3d, OO3DData, "Scan/Scan.jpg", "Scan.obj: its texture Scan.jpg is missing"),
     ],
 )
 def test_scans_without_their_material_are_not_rendered(write, data, missing, message, tmp_path):

@@ -148,7 +148,7 @@ def test_a_sweep_that_is_started_twice_is_shared(sweep):
     with held(sweep.folder / "1"):  # by the other
         ran = sweep("seed=0,1,2")
     assert ran.status == 0, ran.err
-    assert f"skipped, another command is at work on it: {sweep.folder.name}/1" in ran.out.splitlines()
+    assert f"skipped, another command is working on it: {sweep.folder.name}/1" in ran.out.splitlines()
     assert [(sweep.folder / number / "results.json").is_file() for number in "012"] == [True, False, True]
     again = sweep("seed=0,1,2")
     assert again.out.count("skipped, finished before: ") == 2 and (sweep.folder / "1" / "results.json").is_file()

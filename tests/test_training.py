@@ -378,7 +378,7 @@ def test_resuming_what_is_not_there_is_named(commands):
 def test_a_resumed_run_keeps_its_settings(commands, score):
     ran = commands.here("changed", "train", "resume=score", "model.hidden=32")
     assert ran.error == (
-        f"model.hidden cannot be changed by a resumed run: {Path('score/config.yaml')} says what it is; leave it out"
+        f"model.hidden cannot be changed in a resumed run; leave it out ({Path('score/config.yaml')} has its value)"
     )
 
 

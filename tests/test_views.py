@@ -140,7 +140,7 @@ def test_each_view_may_have_its_own_field_of_view(path):
         ({"fl_x": 16.0, "w": 16, "fl_y": 17.0}, "pixels must be square and their cameras centred"),
         ({"fl_x": 16.0, "w": 16, "cx": 6.0}, "and cx and cy the image's middle"),
         ({"fl_x": 16.0, "w": 16, "cy": math.nan}, "and cx and cy the image's middle"),
-        ({"fl_x": 16.0, "w": 16, "camera_angle_x": 0.5}, "camera_angle_x is 0.5, but fl_x and w say 0.9273 radians"),
+        ({"fl_x": 16.0, "w": 16, "camera_angle_x": 0.5}, "camera_angle_x is 0.5, but fl_x and w give 0.9273 radians"),
         ({"camera_angle_x": 49.1}, "must be an angle in radians between 0 and pi, got 49.1"),
         ({"camera_angle_x": None}, "needs camera_angle_x"),
     ],
@@ -221,7 +221,7 @@ def test_no_frames(path):
 @pytest.mark.parametrize("ambiguity", ["threefold", None, 2, ["unique"]])
 def test_unknown_ambiguities(path, ambiguity):
     rewrite(path, ambiguity=ambiguity)
-    assert "is none of unique, twofold, continuous, unlabelled" in sentence(path)
+    assert "is not one of unique, twofold, continuous, unlabelled" in sentence(path)
 
 
 @pytest.mark.parametrize("answer", ["false", 0, []])
@@ -311,7 +311,7 @@ def test_the_inverse_of_a_camera_is_refused(path):
 @pytest.mark.parametrize("matrix", [at(0, 0, 0), at(1e-9, 0, 0), at(1e300, 1e300, 1e300)])
 def test_cameras_at_the_origin_or_nowhere(path, matrix):
     rewrite_frame(path, 1, transform_matrix=matrix)
-    assert "the camera of frame 1 must stand off the origin" in sentence(path)
+    assert "the camera of frame 1 must not be at the origin" in sentence(path)
 
 
 # ---------------------------------------------------------------- whatever comes

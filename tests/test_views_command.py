@@ -204,11 +204,11 @@ def test_the_prior_that_ships_draws_the_embedded_objects(lp, tmp_path):
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
-        ("object=tran", "the data have no object 'tran'; did you mean 'tram'? (known: cup, tram, vase)"),
+        ("object=tran", "the data set has no object 'tran'; did you mean 'tram'? (known: cup, tram, vase)"),
         ("image=nowhere.png", "image=nowhere.png: there is no such file"),
         ("image=.", ".: is a folder; give an image file"),
-        ("longitudes=0", "longitudes must be a number of them, at least 1, got 0"),
-        ("longitudes=2.5", "longitudes must be a number of them, at least 1, got 2.5"),
+        ("longitudes=0", "longitudes must be a whole number, at least 1, got 0"),
+        ("longitudes=2.5", "longitudes must be a whole number, at least 1, got 2.5"),
         ("latitudes_degrees=[]", "latitudes_degrees must list different angles between -180 and 180, got []"),
         (
             "latitudes_degrees=[9,9.0]",

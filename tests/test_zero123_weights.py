@@ -223,9 +223,9 @@ def test_a_file_that_is_missing_or_no_checkpoint(tmp_path):
     assert "there is no such file" in refused(tmp_path / "absent.ckpt")
     text = tmp_path / "text.ckpt"
     text.write_text("<html>404</html>")
-    assert "no PyTorch checkpoint" in refused(text)
+    assert "not a PyTorch checkpoint" in refused(text)
     (tmp_path / "empty.ckpt").touch()
-    assert "no PyTorch checkpoint" in refused(tmp_path / "empty.ckpt")
+    assert "not a PyTorch checkpoint" in refused(tmp_path / "empty.ckpt")
     with zipfile.ZipFile(tmp_path / "archive.ckpt", "w") as archive:
         archive.writestr("readme.txt", "nothing")
     assert "not one that torch.save wrote" in refused(tmp_path / "archive.ckpt")
@@ -284,7 +284,7 @@ def test_a_pickle_that_would_run_code_is_refused_and_not_run(tensors, tmp_path, 
     path = saved(contents, tmp_path)
     sentence = refused(path)
     name = "getattr" if function is Path.touch else function.__name__
-    assert re.search(rf"is refused, unpickling it would run '[\w.]+\.{name}'", sentence)
+    assert re.search(rf"is refused, because unpickling it would run '[\w.]+\.{name}'", sentence)
     assert not mark.exists()
 
 
@@ -400,7 +400,7 @@ def test_weights_in_shards_with_an_index(folder, networks, tmp_path):
     whole.with_name(f"{whole.name}.index.json").write_text(json.dumps({"weight_map": owners}))
     assert same(load_networks(str(path), None, "ema", "float32"), networks)
     whole.with_name([*shards][1]).unlink()
-    assert "-00002-of-00002.safetensors: is no safetensors file" in refused(path)
+    assert "-00002-of-00002.safetensors: is not a safetensors file" in refused(path)
     whole.with_name(f"{whole.name}.index.json").write_text("[]")
     assert "names no files of weights" in refused(path)
 
@@ -478,7 +478,7 @@ def test_no_network_is_one_sentence(monkeypatch, tmp_path):
 
     monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", unreachable)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    assert "does not give it (no route to host); give prior.path=" in refused("someone/zero123")
+    assert "does not provide it (no route to host); set prior.path to" in refused("someone/zero123")
 
 
 def test_of_a_repository_only_what_is_needed_is_downloaded(monkeypatch, folder, networks):
@@ -509,7 +509,7 @@ def test_a_repository_that_is_not_there(monkeypatch):
         raise RepositoryNotFoundError("404", response=response)
 
     monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", absent)
-    with pytest.raises(UserError, match=r"does not give it at revision v9 \(404"):
+    with pytest.raises(UserError, match=r"does not provide it at revision v9 \(404"):
         download("someone/zero123", "v9")
 
 

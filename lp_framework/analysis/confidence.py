@@ -64,7 +64,7 @@ class Answer(NamedTuple):
         if self.second is None:
             return ""
         turn = abs(math.degrees(_turn(self.second.longitude - self.longitude)))
-        why = " (about half a turn away: the back looks alike)" if turn > 180 - NEAR_DEGREES else ""
+        why = " (about half a turn away: front and back look alike)" if turn > 180 - NEAR_DEGREES else ""
         return f"{self.second.words}, probability {self.second.probability:.2f}{why}"
 
 

@@ -50,7 +50,7 @@ TIMESTEPS = (100, 300, 500, 700, 900)
 SECONDS, SHARE = 30.0, 0.1
 ABOUT = (
     "Poses are (latitude, longitude, radius) in radians and object sizes; relative ones are query minus reference. "
-    "Errors are degrees and object sizes, one a start; a trajectory goes from its start to its end."
+    "Errors are in degrees and object sizes, one per start; a trajectory goes from its start to its end."
 )
 ARRAYS = ("truth", "starts", "trajectories", "ends", "energies", "rotation_errors", "translation_errors")
 

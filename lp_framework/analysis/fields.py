@@ -55,7 +55,7 @@ def checked_draws(timesteps: object, noises: object, seed: int, batch: object = 
             raise UserError(f"{key} must be a whole number, at least 1, got {value}")
     steps = list(timesteps) if isinstance(timesteps, Sequence) else []
     if not steps or not all(isinstance(each, int) for each in steps):
-        raise UserError(f"timesteps must list whole numbers, one at least, got {timesteps}")
+        raise UserError(f"timesteps must be a list of one or more whole numbers, got {timesteps}")
     return Draws(steps, noises, seed, batch)  # type: ignore[arg-type]  # both are whole numbers
 
 

@@ -139,10 +139,12 @@ def landscape_grid(
     """
     limit, step, longitude_step = latitude_limit_degrees, latitude_step_degrees, longitude_step_degrees
     if not 0 < limit < 180 or not 0 < step <= limit:
-        raise UserError(f"latitudes need a limit between 0 and 180 degrees and a step up to it, got {limit} by {step}")
+        raise UserError(
+            f"latitudes need a limit between 0 and 180 degrees and a step no larger, got {limit} and {step}"
+        )
     count = round(360 / longitude_step) if 0 < longitude_step <= 120 else 0
     if count < 3 or abs(count * longitude_step - 360) > 1e-6:
-        raise UserError(f"longitude_step_degrees must divide 360 into three or more, got {longitude_step}")
+        raise UserError(f"longitude_step_degrees must divide 360 into three or more parts, got {longitude_step}")
     latitude = torch.arange(math.floor(2 * limit / step + 1e-9) + 1, dtype=torch.float64) * step - limit
     longitude = torch.arange(count, dtype=torch.float64) * (360 / count)
     return latitude.deg2rad().float(), longitude.deg2rad().float()

@@ -157,9 +157,9 @@ def named_pairs(
         views = table.views_of(object_index(data, name))
         for place, what in zip(pair, ("reference", "query"), strict=True):
             if not 0 <= place < len(views):
-                raise UserError(f"object '{name}' has test views 0 to {len(views) - 1}, there is no {what} {place}")
+                raise UserError(f"object '{name}' has test views 0 to {len(views) - 1}; there is no {what} {place}")
         if pair[0] == pair[1]:
-            raise UserError(f"reference and query must be two views, got {pair[0]} for both")
+            raise UserError(f"reference and query must be two different views, got {pair[0]} for both")
         chosen.append([views[place] for place in pair])
     return shown_pairs(data.data("test"), np.array(chosen), device)
 
@@ -168,7 +168,7 @@ def object_index(data: PairDataModule, name: str) -> int:
     """The place of an object in the table of test views; `UserError` where there is none of that name."""
     names = data.table("test").names
     if name not in names:
-        raise UserError(f"the data have no object '{name}'{nearest(name, names)} (known: {', '.join(names)})")
+        raise UserError(f"the data set has no object '{name}'{nearest(name, names)} (known: {', '.join(names)})")
     return names.index(name)
 
 

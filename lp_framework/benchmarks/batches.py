@@ -1,4 +1,4 @@
-"""Batches of pairs among few views, each view once, against two images a pair: loading, encoding, training."""
+"""Batches of pairs among few views, each view once, against two images per pair: loading, encoding, training."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def measure_loading(section: Section, data: PairDataModule, new_model: Denoising
         return work
 
     loaders = feature_space(data), plain_pairs(data)
-    section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
+    section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs per batch"
     kept = [kept_for_backward(new_model, next(batches).to(section.device)) for batches in loaders]  # and a warm-up
     section.add("memory for backward, kB a pair", kept[0] / 1024, kept[1] / 1024)
-    works = {"pairs a second": (training(loaders[0]), training(loaders[1]))}
+    works = {"pairs per second": (training(loaders[0]), training(loaders[1]))}
     section.race(works, rounds, rate=True, warm_up=False)
 
 
@@ -52,7 +52,7 @@ def measure_encoding(
     The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
     against features of both images of every pair at every step. Batches are drawn beforehand.
     """
-    section.title, section.contenders = "encoding: the images of pairs", ("each view once", "two images a pair")
+    section.title, section.contenders = "encoding: the images of pairs", ("each view once", "two images per pair")
     once, plain = next(feature_space(data)), next(plain_pairs(data))
     head = new_model.backbone.head
     optimizer = torch.optim.Adam([*head.parameters(), *new_model.network.parameters()], lr=0.0)
@@ -72,11 +72,11 @@ def measure_encoding(
 
     trunk = new_model.backbone.trunk
     kept = encoded(trunk, once)
-    section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs a batch"
+    section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs per batch"
     works = {
-        "pairs a second, backbone": encoding(new_model.encode),
-        "pairs a second, prior": encoding(prior.encode),
-        "pairs a second, training on a frozen backbone": (
+        "pairs per second, backbone": encoding(new_model.encode),
+        "pairs per second, prior": encoding(prior.encode),
+        "pairs per second, training on a frozen backbone": (
             worth(len(once), lambda: train(once, lambda: kept)),
             worth(len(plain), lambda: train(plain, lambda: encoded(trunk, plain))),
         ),
@@ -91,7 +91,7 @@ def feature_space(data: PairDataModule) -> Iterator[PairBatch]:
 
 
 def plain_pairs(data: PairDataModule) -> Iterator[PairBatch]:
-    """Pairs drawn at random, two images a pair, as a data set of image pairs gives them."""
+    """Pairs drawn at random, two images per pair, as a data set of image pairs gives them."""
     views, random = data.data("train"), np.random.default_rng(0)
     everything = views.table.pairs()
     while True:

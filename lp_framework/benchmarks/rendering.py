@@ -25,7 +25,7 @@ def measure(section: Section, object: str, renderer: Renderer, views: int, resol
     """Views around an embedded object by the chosen renderer, from a mesh file (GLB)."""
     objects = {each.name: each for each in toy_objects()}
     if object not in objects:
-        raise UserError(f"rendering.object={object} is none of the embedded objects{among(object, objects)}")
+        raise UserError(f"rendering.object={object} is not one of the embedded objects{among(object, objects)}")
     cameras = around(views)
     section.title, section.contenders = "rendering: views of a mesh file", ("mesh loaded once", "for every view")
     section.note = f"{object}, {views} views of {resolution} x {resolution} pixels"
@@ -33,7 +33,7 @@ def measure(section: Section, object: str, renderer: Renderer, views: int, resol
         file = Path(folder) / f"{object}.glb"
         objects[object].load().export(file)
         once, each_time = (partial(draw, renderer, file, cameras, resolution) for draw in (drawn, drawn_one_by_one))
-        works = {f"{renderer.name}, views a second": (worth(views, once), worth(views, each_time))}
+        works = {f"{renderer.name}, views per second": (worth(views, once), worth(views, each_time))}
         section.race(works, rounds, rate=True)
 
 

@@ -57,8 +57,8 @@ def measure_first_stage(section: Section, model: PoseModel, views: int, starts: 
     every = all_pairs(model.backbone.image_size, max(2, views), section.device)
     one = Pairs(every.images[:2], every.reference[:1], every.query[:1], every.ids[:1])
     named = {"1 pair": one, f"{len(every)} pairs of {len(every.images)} images": every}
-    section.note = f"{solver.iterations} iterations from {starts} starts a pair; each encodes the images it needs"
-    section.race({f"{label}, starts a second": works(pairs) for label, pairs in named.items()}, rounds, rate=True)
+    section.note = f"{solver.iterations} iterations from {starts} starts per pair; each encodes the images it needs"
+    section.race({f"{label}, starts per second": works(pairs) for label, pairs in named.items()}, rounds, rate=True)
 
 
 def all_pairs(side: int, views: int, device: torch.device) -> Pairs:
@@ -98,7 +98,7 @@ def measure_descent(
         level = max(min(energies) for energies, _ in descents)
         steps = [next(step for step, each in enumerate(energies) if each <= level) for energies, _ in descents]
         reached = [passes[step] for (_, passes), step in zip(descents, steps, strict=True)]
-        section.add(f"gamma {gamma:g} before, to equal energy: passes a start", *reached)
+        section.add(f"gamma {gamma:g} before, to equal energy: passes per start", *reached)
         section.facts[f"gamma {gamma:g}"] = {
             "energy": {"start": descents[1][0][0], "equal": level},
             "steps": dict(zip(section.contenders, steps, strict=True)),
@@ -107,7 +107,7 @@ def measure_descent(
 
 
 def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
-    """At the start and after each step of a solution: mean energies on the probe, and network passes a start so far.
+    """At the start and after each step of a solution: mean energies on the probe, and network passes per start so far.
 
     Before its first step it has passed the network `looks` times as often as in each.
     """

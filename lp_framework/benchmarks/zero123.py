@@ -164,12 +164,12 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
         section.add(f"{told(count)}, peak memory, GB", peak / 1e9, loop_peak / 1e9)
     section.note = (
         f"Zero123's {computing.architecture} size, random weights. {BATCHED}: all starts and both directions "
-        f"together, images encoded once ({encoding:.3g} s, not counted); {LOOP}: a start at a time, images anew each "
-        "step"
+        f"together, images encoded once ({encoding:.3g} s, not counted); {LOOP}: one start at a time, images "
+        "encoded again at each step"
     )
     section.facts = {"encoding_seconds": encoding}
     works = {
-        f"{told(count)}, seconds a step": (
+        f"{told(count)}, seconds per step": (
             batched(ready, pair, poses, steps),
             worth(steps, partial(looped, loops[:count], steps)),
         )
@@ -202,12 +202,14 @@ def measure_pair(
     section.facts["first_pair_seconds"] = first
     section.note = (
         f"Zero123's {computing.architecture} size, random weights. {BATCHED}: two_stage with {steps} steps of its "
-        f"second stage; {LOOP}: as many of each start, images anew each step. "
+        f"second stage; {LOOP}: as many for each start, images encoded again at each step. "
         f"The first pair took {', '.join(f'{seconds:.3g} s from {count}' for count, seconds in first.items())}. "
         "The paper's pairs, of 50 steps at the published size on an RTX 6000 Ada, take "
         f"{', '.join(f'{seconds} s from {count}' for count, seconds in paper_seconds.items())}"
     )
-    works = {f"{told(count)}, seconds a pair": (work, worth(1, partial(plain, count))) for count, work in ours.items()}
+    works = {
+        f"{told(count)}, seconds per pair": (work, worth(1, partial(plain, count))) for count, work in ours.items()
+    }
     section.race(works, rounds, warm_up=False)
 
 
@@ -222,7 +224,7 @@ def variant(words: str, architecture: Architecture, max_batch: int | None) -> Co
     dtypes = [word for word in chosen if word in DTYPES]
     if not chosen or len(dtypes) > 1 or not {*chosen} <= {*known}:
         raise UserError(
-            f"precision.variants: '{words}' is none; give one or more of {', '.join(known)}, with one dtype at most"
+            f"precision.variants: '{words}' is not one; give one or more of {', '.join(known)}, with at most one dtype"
         )
     settings = {"dtype": dtypes[0] if dtypes else "float32", **{word: word in chosen for word in SWITCHES}}
     return Computing(architecture, **settings, max_batch=max_batch)  # type: ignore[arg-type]
@@ -253,7 +255,7 @@ def measure_precision(
         off = ((gradient(theirs, pair, poses) - exact).abs().max() / exact.abs().max()).item()
         section.note += f"; {words}: gradient off by {off:.1g}"
         section.facts[words] = {"gradient_deviation": off}
-        label = f"{words}: seconds a step"
+        label = f"{words}: seconds per step"
         section.race({label: (batched(theirs, pair, poses, steps), batched(ready, pair, poses, steps))}, rounds)
         if device.type == "cuda":
             section.add(f"{words}: peak memory, GB", its_memory / 1e9, memory / 1e9)

@@ -44,7 +44,7 @@ def run(config: DictConfig) -> None:
     names = [settings["measure"]] if isinstance(settings["measure"], str) else settings["measure"]
     for name in names:
         if name not in MEASUREMENTS:
-            raise UserError(f"measure={name} is none of the measurements{among(str(name), MEASUREMENTS)}")
+            raise UserError(f"measure={name} is not a measurement{among(str(name), MEASUREMENTS)}")
     facts = {
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu",
         "threads": torch.get_num_threads(),
@@ -100,7 +100,7 @@ def _settings(settings: Mapping[str, Any], section: str, taker: Callable[..., An
 
 
 def paper_seconds() -> dict[int, float]:
-    """The paper's seconds a pair by the number of starts (appendix, Analysis of Inference Time)."""
+    """The paper's seconds per pair by the number of starts (appendix, Analysis of Inference Time)."""
     table = paper_table("starts")
     assert table is not None  # it is in this package
     rows = [row for row in table.rows if row.settings["solver.name"] == "two_stage"]

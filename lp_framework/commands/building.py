@@ -177,7 +177,7 @@ def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[s
     keys = {override.partition("=")[0].strip("+~") for override in overrides} - {"resume", "plugins"}
     for key in sorted(keys):
         if not key.startswith(changeable):
-            raise UserError(f"{key} cannot be changed by a resumed run: {saved} says what it is; leave it out")
+            raise UserError(f"{key} cannot be changed in a resumed run; leave it out ({saved} has its value)")
         OmegaConf.update(previous, key, OmegaConf.select(config, key), merge=False, force_add=True)
     return previous
 

@@ -40,7 +40,7 @@ def run(config: DictConfig) -> None:
             photographs, config.crop, components["solver"], components["start"], prior, first, device, config.seed
         )
     if not found.valid:
-        log.warning("the solver did not come to a sound pose for every image")
+        log.warning("the solver did not find a valid pose for every image")
     checkpoint = str(components.checkpoint) if components.checkpoint else None
     written = write_estimate(folder, found, {"checkpoint": checkpoint, **components.record()})
     _print(folder, found, written)

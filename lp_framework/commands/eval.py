@@ -46,7 +46,9 @@ def run(config: DictConfig) -> None:
         config, checkpoint = unfinished_evaluation(folder, config)
     settings = building.plain(config)
     if settings["trainer"].get("precision", "32-true") != "32-true":
-        raise UserError("trainer.precision: poses are computed in float32; prior.dtype=bfloat16 is Zero123's own")
+        raise UserError(
+            "trainer.precision must be 32-true, as poses are computed in float32; for Zero123 set prior.dtype"
+        )
     if not isinstance(settings["pictures"], bool):
         raise UserError(f"pictures must be true or false, got {settings['pictures']}")
     building.seed_run(settings["seed"])
@@ -129,9 +131,9 @@ def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig,
     """The config and the checkpoint of the stopped `eval` in `folder`; `UserError` where there is none."""
     subject = journal.unfinished(folder)
     if subject is None and (folder / RESULT).is_file():
-        raise UserError(f"resume={folder}: that run is finished, {folder / RESULT} has its results")
+        raise UserError(f"resume={folder}: that run is finished; its results are in {folder / RESULT}")
     if subject is None:
-        raise UserError(f"resume={folder}: holds no {journal.FOLDER} evaluation to go on from; give the folder of one")
+        raise UserError(f"resume={folder}: holds no {journal.FOLDER} evaluation to resume; give the folder of one")
     previous = OmegaConf.create(subject["config"])
     checkpoint = Path(subject["checkpoint"]) if subject["checkpoint"] else None
     return building.with_overrides(previous, config, journal.MOVABLE, folder / journal.FOLDER), checkpoint

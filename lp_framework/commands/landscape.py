@@ -89,7 +89,7 @@ def check(config: DictConfig) -> None:
         given = (override.partition("=")[0] for override in HydraConfig.get().overrides.task)
         for key in given:
             if key.partition(".")[0] in OF_A_PAIR:
-                raise UserError(f"{key} is of the landscape of a pair; give object=NAME or images=[A.png,B.png], too")
+                raise UserError(f"{key} is for the landscape of a pair; also give object=NAME or images=[A.png,B.png]")
     if config.object is not None and config.images is not None:
         raise UserError("give object=NAME for views of the data set or images=[A.png,B.png], not both")
 
@@ -104,7 +104,7 @@ def pair_figures(pair: ShownPair, views: Sequence[NDArray], draws: Draws, headin
         "surface": surface_figure(energy, pair.truth, pair.object),
     }
     if pair.maps:
-        note = "ways of the first stage without noise (langevin, gamma 0)"
+        note = "trajectories of the first stage without noise (langevin, gamma 0)"
         figures["fields"] = pair_figure(pair, pair.maps, pair.object, note)
     return figures
 
@@ -124,7 +124,7 @@ def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownP
     """The two files of `images`, prepared as `estimate` prepares them, with its reference camera."""
     files = photograph_files(config.images)
     if len(files) != 2:
-        raise UserError(f"images: a landscape is of two files, got {len(files)}")
+        raise UserError(f"images: a landscape needs two files, got {len(files)}")
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
     warn_of_photographs(plain(config.prior))
     pairs = view_set(prepared, device).pairs([0], [1])
@@ -215,7 +215,7 @@ def overview_table(title: str, record: dict[str, Any]) -> Table:
             table.add_row(name, "", f"{record[key]:.3f}", "", "")
     unanswered = [row["object"] for row in record["objects"] if not row["ambiguity_score"]["unique_answer"]]
     if unanswered:
-        table.caption = f"without a unique answer to this prior: {', '.join(unanswered)}"
+        table.caption = f"without a unique answer for this prior: {', '.join(unanswered)}"
     return table
 
 

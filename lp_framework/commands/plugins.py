@@ -16,7 +16,7 @@ USAGE = """\
 Usage: lp plugins [plugins=FOLDER,...]
 
 Lists the members of every group: choose one with GROUP=NAME, change a setting with GROUP.SETTING=VALUE.
-Plugins are looked for in installed packages, in plugins/ of the working directory and in the folders named.
+Plugins are found in installed packages, in plugins/ of the working directory and in the folders that you name.
 A folder that holds Python files or a pyproject.toml is one plugin; any other folder is searched for plugins one level
 down."""
 

@@ -77,7 +77,7 @@ def run(config: DictConfig) -> None:
 def angles(latitudes: Sequence[float], count: int) -> tuple[list[float], list[float]]:
     """The rows' relative latitudes and the columns' relative longitudes, degrees."""
     if not isinstance(count, int) or count < 1:
-        raise UserError(f"longitudes must be a number of them, at least 1, got {count}")
+        raise UserError(f"longitudes must be a whole number, at least 1, got {count}")
     chosen = list(latitudes) if isinstance(latitudes, Sequence) else []
     in_range = all(isinstance(each, int | float) and -180 < each < 180 for each in chosen)
     if not chosen or not in_range or len({*chosen}) < len(chosen):

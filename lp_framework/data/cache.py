@@ -59,7 +59,7 @@ def _write(folder: Path, key: str, count: int, blocks: Iterable[NDArray]) -> Non
             array[place : place + len(block)] = block
             place += len(block)
         if array is None or place != count:
-            raise ValueError(f"the blocks of {key} have {place} rows, {count} are wanted")
+            raise ValueError(f"the blocks of {key} have {place} rows, expected {count}")
         array.flush()
         note.write_text(json.dumps({"shape": array.shape, "dtype": array.dtype.str, "checksum": _checksum(array)}))
         del array

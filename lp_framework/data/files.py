@@ -74,7 +74,7 @@ def chosen(names: Sequence[str], wanted: str | Sequence[str] | None, where: obje
         return sorted(names)
     found = sorted({wanted} if isinstance(wanted, str) else {*wanted})
     if not found:
-        raise UserError("data.objects is empty; it needs the name of an object")
+        raise UserError("data.objects is empty; it needs the name of at least one object")
     for name in found:
         if name not in names:
             raise UserError(f"data.objects: there is no '{name}' in {where}{nearest(name, names)}")
@@ -104,10 +104,10 @@ def check_upright(camera: Tensor, where: str, up: str = "+Y") -> None:
     if not is_rotation(camera[:3, :3]) or (camera[3] - camera.new_tensor([0, 0, 0, 1])).abs().max() >= 1e-3:
         raise UserError(f"{where} is not a rigid camera-to-world transform")
     if not 1e-6 < camera[:3, 3].norm() < torch.inf:
-        raise UserError(f"{where} must stand off the origin; its distance is {camera[:3, 3].norm():g}")
+        raise UserError(f"{where} must not be at the origin; its distance is {camera[:3, 3].norm():g}")
     residual = spherical_residual(camera).item()
     if not residual <= LARGEST_RESIDUAL:
-        off = f"it is {residual:.1f} degrees off, {LARGEST_RESIDUAL:g} are allowed"
+        off = f"it is {residual:.1f} degrees off; at most {LARGEST_RESIDUAL:g} are allowed"
         raise UserError(f"{where} does not look at the origin with {up} up ({off})")
 
 
@@ -225,7 +225,7 @@ def drawn(available: Sequence[str], seen: int | None, unseen: int, seed: int, wh
         raise UserError(f"{where}: the numbers of objects must not be negative, got {seen} seen and {unseen} unseen")
     if len(names) < needed:
         wanted = f"{needed} are needed ({seen} seen and {unseen} unseen)"
-        raise UserError(f"{where}: {len(names)} objects are there, {wanted}")
+        raise UserError(f"{where}: {len(names)} objects are there, but {wanted}")
     order = [names[index] for index in np.random.default_rng(seed).permutation(len(names))]
     return ObjectLists(sorted(order[unseen:needed]), sorted(order[:unseen]))
 
@@ -245,5 +245,7 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
         changed = differences(content["chosen"], how)
         seen, unseen = ([str(name) for name in content[key]] for key in ("seen", "unseen"))
     if changed:
-        raise UserError(f"{path}: its objects were chosen otherwise ({changed}); choose another folder of views")
+        raise UserError(
+            f"{path}: its objects were chosen with other settings ({changed}); choose another folder of views"
+        )
     return ObjectLists(seen, unseen)

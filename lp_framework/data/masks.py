@@ -30,7 +30,7 @@ STRAY = 0.25  # of the largest part's size; smaller separate parts are strays
 ROUGH_SIDE = 512  # pixels of the longest side to which GrabCut's input is reduced, for speed
 MARGIN = 0.05  # of a side: the border that GrabCut assumes to be background
 ROUNDS = 5  # iterations of GrabCut
-ROUGH = "a rough mask was made by GrabCut, since rembg {why}; an alpha channel, masks=FOLDER or rembg is better"
+ROUGH = "a rough mask was made by GrabCut, because rembg {why}; an alpha channel, masks=FOLDER or rembg is better"
 
 
 def alpha_opacity(alpha: Image.Image) -> Image.Image | None:
@@ -63,7 +63,7 @@ def mask_opacity(mask: Image.Image, name: str) -> Image.Image | None:
     if len(levels) != 2 and not coloured and not _are_labels(values, levels, full):
         return _stretched(values, low, full)
     if len(levels) > 2:
-        warnings.warn(f"{name}: its mask has {len(levels) - 1} labels; all are taken for the object", stacklevel=2)
+        warnings.warn(f"{name}: its mask has {len(levels) - 1} labels; all of them count as the object", stacklevel=2)
     return _stretched(values > low, 0, 1)
 
 
@@ -78,7 +78,7 @@ def _levels(mask: Image.Image, name: str) -> tuple[NDArray[Any], bool]:
     if int(np.ptp(pixels, axis=2).max()) <= GREY:
         return np.asarray(mask.convert("L")), False
     if colours.getcolors(MOST_LABELS) is None:
-        wanted = "a mask is black and white, or has one colour for each label"
+        wanted = "a mask is black and white, or has one colour per label"
         raise UserError(f"{name}: its mask is a picture of more than {MOST_LABELS} colours; {wanted}")
     return pixels.astype(np.int32) @ np.array([65536, 256, 1], dtype=np.int32), True
 
@@ -113,7 +113,7 @@ def without_strays(opacity: Image.Image, name: str) -> Image.Image:
     apart = 1 + np.nonzero((boxes < boxes[largest - 1]).any(axis=1))[0]
     strays = apart[sizes[apart] < STRAY * sizes[largest]]
     if len(apart) > len(strays):
-        others = f"{len(apart) - len(strays) + 1} separate parts, which are all taken for the object"
+        others = f"{len(apart) - len(strays) + 1} separate parts, all of which count as the object"
         warnings.warn(f"{name}: its mask has {others}", stacklevel=2)
     if not len(strays):
         return opacity

@@ -97,7 +97,7 @@ def load_scene(path: Path, up: Literal["y", "z"] = "y", folders: Sequence[Path] 
         scene = normalise(scene)
     axis = UP_AXES.get(path.suffix.lower(), up)
     if axis != up:
-        warn(path, f"files of this format have +{axis.upper()} up, data.up={up} is set")
+        warn(path, f"files of this format have +{axis.upper()} up, but data.up={up} is set")
     if plain := sum(not _has_colour(mesh) for mesh in scene.geometry.values()):
         grey = f"{plain} of {len(scene.geometry)} meshes have no texture or colour; they are drawn in light grey"
         warn(path, grey, MissingColourWarning)
@@ -116,7 +116,7 @@ def normalise(scene: trimesh.Scene) -> trimesh.Scene:
     lowest, highest = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     side = (highest - lowest).max()
     if not (np.isfinite(side) and side > 0):
-        raise ValueError(f"it has no proper extent, the longest side of its bounding box is {side}")
+        raise ValueError(f"it has no valid extent: the longest side of its bounding box is {side}")
     if not any(mesh.area > 0 for mesh in meshes):
         raise ValueError("all of its faces have area 0")
     for mesh in meshes:

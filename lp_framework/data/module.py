@@ -64,7 +64,7 @@ class PairDataModule(LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        wanted = "at least 2, for a pair needs two views, or 0 for no validation"
+        wanted = "at least 2, because a pair needs two views, or 0 for no validation"
         check_settings(
             "data",
             ("image_size", image_size, image_size >= 8, "at least 8"),
@@ -158,7 +158,9 @@ class PairDataModule(LightningDataModule):
         if views is not None and (not isinstance(views, int) or not 2 <= views <= LARGEST_SET):
             raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
         if views is not None and protocol != "ordered":
-            raise UserError(f"protocol={protocol} is for pairs; views={views} has a protocol of its own, leave it out")
+            raise UserError(
+                f"protocol={protocol} is for pairs; views={views} has a protocol of its own, so leave it out"
+            )
         self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), views, batch_pairs
 
     def leave_out(self, pairs: Iterable[Sequence[int]]) -> None:

@@ -27,7 +27,7 @@ def photograph_files(images: str | Path | Sequence[str | Path] | None) -> list[P
     if isinstance(images, str | Path):
         folder = Path(images)
         if not folder.is_dir():
-            what = "is one image, two or more are needed" if folder.exists() else "there is no such folder"
+            what = "is one image, but two or more are needed" if folder.exists() else "there is no such folder"
             raise UserError(f"images={folder}: {what}; give a list, images=[A.png,B.png], or a folder")
         found = _images_in(folder)
         if left_out := [file.name for file in sorted(folder.iterdir()) if file not in found and _may_show(file)]:

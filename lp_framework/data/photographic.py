@@ -110,7 +110,7 @@ def decoded_renderings(
     files = [file for each in views for file in each.files]
     depths = [file.parents[1] / "depth" / file.name for file in files]
     if missing := [file for file in depths if not file.is_file()]:
-        raise UserError(f"{missing[0]}: there is no such file; views rendered with data.depth=true have depths")
+        raise UserError(f"{missing[0]}: there is no such file; render the views with data.depth=true")
     record = np.dtype([("pixels", "u1", (size, size, 3)), ("points", "f2", (CELLS * CELLS, 3)), ("cropped", "?")])
 
     def decode(

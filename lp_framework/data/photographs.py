@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 SIZE, EXTENT = 256, 200  # pixels a side of a prepared image, and of the object's longest side in it
 SMALLEST = 16  # pixels; a smaller object shows too little detail
 CUT_OFF = 0.1  # of the object's longest side: more along the border means that the object is cut off
-EMPTY = "its mask is empty, nothing in it is at least half opaque"
+EMPTY = "its mask is empty: none of it is at least half opaque"
 FULL_FRAME = math.hypot(36, 24)  # mm: the diagonal of 35 mm film
 RESOLUTION_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # mm, by EXIF's FocalPlaneResolutionUnit
 
@@ -163,7 +163,7 @@ def made_mask(image: Image.Image, name: str) -> Image.Image:
     maker = mask_maker()
     mask = maker.mask(image.convert("RGB"))
     if alpha_opacity(mask) is None:
-        raise UserError(f"{name}: {maker.name} finds no background in it; give a mask")
+        raise UserError(f"{name}: {maker.name} found no background in it; give a mask")
     return mask
 
 
@@ -182,19 +182,17 @@ def crop_to_object(image: Image.Image, name: str) -> Prepared:
     box = Image.fromarray(opaque).getbbox()
     if box is None:
         most = int(np.asarray(opacity).max())
-        empty = f"nothing in its mask is at least half opaque, at most {most / 255:.0%}" if most else EMPTY
+        empty = f"none of its mask is at least half opaque (at most {most / 255:.0%})" if most else EMPTY
         raise UserError(f"{name}: {empty}")
     left, top, right, bottom = box
     longest = max(right - left, bottom - top)
     if longest < SMALLEST:
-        raise UserError(f"{name}: the object is {longest} pixels long, at least {SMALLEST} are needed")
+        raise UserError(f"{name}: the object is {longest} pixels long, but at least {SMALLEST} are needed")
     border = (opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1])
     if all(line.all() for line in border):
-        log.warning("%s: all of the image's border is the object's; a mask is white where the object is", name)
+        log.warning("%s: the whole image border counts as the object; a mask must be white on the object", name)
     elif max(int(line.sum()) for line in border) > CUT_OFF * longest:
-        log.warning(
-            "%s: the image's border seems to cut the object off; an answer wants all of it in the picture", name
-        )
+        log.warning("%s: the image border seems to cut off the object; all of it should be in the picture", name)
     side = longest * SIZE / EXTENT
     corners = np.array([left + right - side, top + bottom - side, left + right + side, top + bottom + side]) / 2
     whole = (*(math.floor(corner) for corner in corners[:2]), *(math.ceil(corner) for corner in corners[2:]))
@@ -212,7 +210,7 @@ def prepare(
     if crop:
         return crop_to_object(cut_out(image, name, mask, remove_background), name).image
     if image.width != image.height:
-        raise UserError(f"{name}: is {image.width} x {image.height} pixels; without crop an image must be square")
+        raise UserError(f"{name}: is {image.width} x {image.height} pixels; with crop=false an image must be square")
     whole = cut_out(image, name, mask, remove_background, required=False)
     return whole.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
 
@@ -247,7 +245,7 @@ def read_photographs(
     if masks is None:
         found = [None if marked else mask_beside(file) for file, marked in zip(files, marks, strict=True)]
         if beside := [mask.name for mask in found if mask is not None]:
-            log.info("masks that lie beside the photographs are taken: %s", listed(beside))
+            log.info("using the masks beside the photographs: %s", listed(beside))
     given = [None if mask is None else read_mask(mask) for mask in found]
     read = []
     for file, image, mask, marked in zip(files, images, given, marks, strict=True):
@@ -255,7 +253,7 @@ def read_photographs(
             if crop and not marked and not remove_background:
                 raise UserError(no_mask(file, masks))
             instead = "alpha channel" if marked else "made mask" if remove_background else "whole picture"
-            warnings.warn(f"{no_mask(file, masks)}; its {instead} is taken", stacklevel=2)
+            warnings.warn(f"{no_mask(file, masks)}; its {instead} is used", stacklevel=2)
         made = remove_background and mask is None and not marked
         read.append(Photograph(str(file), image, made_mask(image, str(file)) if made else mask, made))
     return read

@@ -240,7 +240,7 @@ def frame_of_silhouettes(cameras: Tensor, intrinsics: Tensor, pixels: list[NDArr
     across, high = ((extents[:, 1] - extents[:, 0]) * distances).unbind(-1)
     sides = torch.stack([across.quantile(0.9), high.median(), across.quantile(0.9)])
     if not sides.max() > 0:
-        raise ValueError("its cameras stand in the object's centre")
+        raise ValueError("its cameras are at the object's centre")
     return ObjectFrame(axes, centre @ axes, sides.max(), sides / sides.max())
 
 
@@ -271,7 +271,7 @@ def _axes(cameras: Tensor) -> Tensor:
         axis = directions[:, 0]
         weights = LEVEL / (right @ axis[:, None]).abs().clamp(min=LEVEL)
     if spread[1] < 0.02:
-        raise ValueError("its cameras do not go round the object, so which way is up cannot be told")
+        raise ValueError("its cameras do not go around the object, so its up direction cannot be determined")
     axis = axis * torch.where((up @ axis).mean() < 0, -1.0, 1.0)
     first = torch.linalg.cross(axis, torch.eye(3, dtype=axis.dtype)[axis.abs().argmin()])
     first = first / first.norm()

@@ -74,7 +74,7 @@ def read_views(root: str | Path, name: str, split: str) -> ObjectViews:
         angles = [_field_of_view(content, frame, path) for frame in content["frames"] or [{}]]
     ambiguity, unique_answer = content.get("ambiguity", "unlabelled"), content.get("unique_answer")
     if ambiguity not in AMBIGUITIES:
-        raise UserError(f"{path}: ambiguity {ambiguity!r} is none of {', '.join(AMBIGUITIES)}")
+        raise UserError(f"{path}: ambiguity {ambiguity!r} is not one of {', '.join(AMBIGUITIES)}")
     if unique_answer is not None and not isinstance(unique_answer, bool):
         raise UserError(f"{path}: unique_answer must be true, false or null, got {unique_answer!r}")
     if not frames:
@@ -110,7 +110,7 @@ def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -
         angle = 2 * math.atan(width / 2 / focal)
         told = float(own.get("camera_angle_x", angle))
         if not abs(told - angle) <= LARGEST_OFFSET:
-            raise UserError(f"{path}: camera_angle_x is {told:.4g}, but fl_x and w say {angle:.4g} radians")
+            raise UserError(f"{path}: camera_angle_x is {told:.4g}, but fl_x and w give {angle:.4g} radians")
     if not 0 < angle < math.pi:
         raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {angle}")
     return angle

@@ -63,7 +63,7 @@ class Evaluation(LightningModule):
             return
         pairs = torch.cat([batch.pair for batch in found])
         data.leave_out(pairs.tolist())
-        self.print(f"going on: {len(pairs.unique(dim=0))} pairs have been solved before")
+        self.print(f"resuming: {len(pairs.unique(dim=0))} pairs are already solved")
         # Each process has some, since a metric without any cannot be gathered.
         for batch in found[self.trainer.global_rank :: self.trainer.world_size] or found[:1]:
             self.metrics.update(batch)

@@ -96,7 +96,7 @@ def begun(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None:
     changed = "" if before is None else changes(before, subject)
     if changed and any((folder / FOLDER).glob("rank_*.jsonl")):
         raise UserError(
-            f"{folder}: holds an unfinished evaluation of something else ({changed}); "
+            f"{folder}: holds another unfinished evaluation ({changed}); "
             f"give another folder, or remove {folder / FOLDER}"
         )
     return None if changed else before

@@ -43,7 +43,7 @@ class PairsFigure(PaperFigure):
     def pairs(self, objects: Sequence[str], device: torch.device) -> tuple[Pairs, list[ShownPair]]:
         """See `named_pairs`; `UserError` for no objects."""
         if not objects:
-            raise UserError("figure.objects needs the name of an object")
+            raise UserError("figure.objects needs the name of at least one object")
         return named_pairs(self.data, objects, [(self.reference, self.query)] * len(objects), device)
 
 

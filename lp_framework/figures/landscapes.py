@@ -83,7 +83,7 @@ class TrajectoriesFigure(EnergyFigure):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 2 <= self.views <= 5:
-            raise UserError(f"figure.views must be 2 to 5 generated views a trajectory, got {self.views}")
+            raise UserError(f"figure.views must be 2 to 5 generated views per trajectory, got {self.views}")
         self.solver = IFusion(self.prior, steps=self.steps)
         shares = [place / (self.views - 1) for place in range(self.views)]
         self.shown_steps = [round(self.steps * share**2) for share in shares]  # most happens at first

@@ -48,7 +48,9 @@ class CamerasFigure(PaperFigure):
 
     def __post_init__(self) -> None:
         if not self.objects or not self.methods or self.targets < 1 or self.starts < 1:
-            raise UserError("figure.objects and figure.methods need a name each, targets and starts at least 1")
+            raise UserError(
+                "figure.objects and figure.methods need at least one name each, targets and starts must be at least 1"
+            )
         wanted = {part for name in self.methods for part in registry.component_names(registry.get("solver", name))}
         self.model = figure_model("score", self.score) if "model" in wanted else None
         built = {"prior": self.prior, "model": self.model}

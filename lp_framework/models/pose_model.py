@@ -62,7 +62,7 @@ class PoseModel(TrainedModule):
 
     def modes(self, condition: Any, count: int) -> Tensor:
         """The most likely poses `[P, count, 3]`, best first; `UserError` if the model has no density."""
-        raise UserError("start=modes needs model=matching; score and energy networks cannot tell their modes")
+        raise UserError("start=modes needs model=matching; the modes of score and energy networks are not known")
 
     def probability(self, condition: Any, pose: Tensor, degrees: float = 30.0) -> Tensor | None:
         """The probability `[...]` that the true rotation is within `degrees` of that of relative poses `[..., 3]`.
@@ -74,8 +74,8 @@ class PoseModel(TrainedModule):
     def at_sigma(self, condition: Any, sigma: float) -> Any:
         """The condition under which `field` is at another `sigma`; `UserError` if the model knows only one."""
         raise UserError(
-            "solver.sigma needs model=matching, whose field is known at every sigma; score and energy networks know "
-            f"the one that they were trained at, {self.sigma:g}"
+            "solver.sigma needs model=matching, whose field is known at every sigma; that of score and energy networks "
+            f"is known only at the sigma of their training, {self.sigma:g}"
         )
 
 

@@ -90,7 +90,7 @@ class TrainedModule(LightningModule):
         if checkpoint.get("trunk") != self.backbone.fingerprint():
             raise UserError(
                 "the frozen part of its backbone has other weights here than when the model was trained; "
-                "the pretrained weights of that time are wanted"
+                "use the same pretrained weights"
             )
         here = self.state_dict()
         for state in WEIGHTS & checkpoint.keys():

@@ -212,7 +212,7 @@ def _about_evaluation(folder: Path) -> About:
             **{f"{name}, {over}": f"{metrics[name]:.1%}" for name in ("R@5", "R@15", "R(R)@15")},
             f"median rotation error, {over}": "\N{INFINITY}" if median is None else f"{median:.1f}°",
             "pairs": str(result["pairs"]),
-            "seconds a pair": f"{result['seconds_per_pair']:.3g}",
+            "seconds per pair": f"{result['seconds_per_pair']:.3g}",
         },
     )
 
@@ -253,7 +253,7 @@ def _about_training(folder: Path) -> About:
     best = {"best validation loss": f"{np.nanmin(losses['val/loss'].value):.4g}"} if "val/loss" in losses else {}
     title = f"{words(config['model']['name'])} model, trained on {config['data']['name']}"
     if not report:
-        return title, "training that has not finished", best
+        return title, "unfinished training", best
     counts = {key: str(report[key]) for key in ("epochs", "steps")}
     return title, f"training over {report['epochs']} epochs, seed {report['seed']}", best | counts
 
@@ -318,7 +318,7 @@ def _about_landscape(folder: Path) -> About:
     if answer is not None and answer["rotation_error"] is not None:
         numbers["rotation error of the answer"] = f"{answer['rotation_error']:.1f}°"
     title = f"Landscape of {files}" if name is None else f"Landscape of {words(name)}, {files}"
-    return title, "the energy of the prior over the relative pose of a pair, and the ways of a solver over it", numbers
+    return title, "the energy of the prior over the relative pose of a pair, and the trajectories of a solver", numbers
 
 
 def _about_azimuths(folder: Path) -> About:
@@ -326,7 +326,7 @@ def _about_azimuths(folder: Path) -> About:
     names = {"within": "least energy within 15°, all objects", "within_unique_answer": "the same, unique answer"}
     return (
         f"Landscapes of {record['config']['data']['name']}, prior {record['config']['prior']['name']}",
-        "the energy of the prior around each object, all but the azimuth true",
+        "the energy of the prior around each object, at the true latitude and radius",
         {label: f"{record[key]:.1%}" for key, label in names.items() if record.get(key) is not None},
     )
 

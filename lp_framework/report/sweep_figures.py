@@ -28,7 +28,7 @@ RECALL, SUCCESS, ROTATION_RECALL = (
 )
 PANELS = {"Recall R (chosen start)": RECALL, "Success rate SR (all starts)": SUCCESS}
 WITHIN = [f"within {degrees}°" for degrees in ROTATION_THRESHOLDS]
-TIME = "seconds a pair (log scale)"
+TIME = "seconds per pair (log scale)"
 SECONDS, SOLVER = "seconds_per_pair", "solver.name"
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -78,7 +78,7 @@ def sweep_figure(table: SweepTable) -> Figure | None:
 
 
 def cost_figure(table: SweepTable) -> Figure | None:
-    """Rotation recall of each solver against its seconds a pair; None for one solver, for more rows than colours, or
+    """Rotation recall of each solver against its seconds per pair; None for one solver, for more rows than colours, or
     where the table's own figure has the time.
     """
     solvers = [row.settings.get(SOLVER) for row in table.rows]
@@ -199,7 +199,7 @@ def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str],
 
 
 def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:
-    """A metric of rows over the setting `axis`, or over the seconds a pair."""
+    """A metric of rows over the setting `axis`, or over the seconds per pair."""
     x = [row.metrics.get(SECONDS, Spread(math.nan)).mean if axis is None else float(row.settings[axis]) for row in rows]
     values = [row.metrics[metric] for row in rows]
     mean, std = (np.array([getattr(each, part) for each in values]) for part in ("mean", "std"))

@@ -62,7 +62,7 @@ def with_weights(load: Callable[[str], Loaded], network: str, weights: str) -> L
     except Exception as error:  # the hub's package and its HTTP libraries have many of their own
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(
-            f"{weights}: the weights of {network} cannot be had from there ({reason}); "
+            f"{weights}: the weights of {network} cannot be loaded from there ({reason}); "
             "give solver.weights= a local path or an id of the Hugging Face hub"
         ) from error
 

@@ -206,8 +206,8 @@ def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]
             scene.axes.set_title(word, loc="right", **style.ASIDE)
     keys = [
         Line2D([], [], color=RED, label="reference", **TRUE),
-        Line2D([], [], color=style.INK, label="true cameras, a colour a view", **TRUE),
-        Line2D([], [], color=style.INK, label="predicted, one for each start", **PREDICTED),
+        Line2D([], [], color=style.INK, label="true cameras, one colour per view", **TRUE),
+        Line2D([], [], color=style.INK, label="predicted, one per start", **PREDICTED),
     ]
     figure.legend(handles=keys, loc="outside lower right", ncols=len(keys))
     return figure

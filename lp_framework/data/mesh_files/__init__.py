@@ -52,7 +52,7 @@ def read_ply(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     header = content.partition(b"\nend_header")[0].decode("utf-8")
     names = list(dict.fromkeys(re.findall(r"^comment\s+TextureFile\s+(.*?)\s*$", header, re.MULTILINE | re.I)))
     if len(names) > 1:
-        raise UserError(f"{path}: has {len(names)} textures, one is read; save it as glTF or OBJ")
+        raise UserError(f"{path}: has {len(names)} textures, but only one can be read; save it as glTF or OBJ")
     textures = {name: texture_bytes(path, name, folders) for name in names}
     files: dict[str, bytes | str] = {name: data for name, data in textures.items() if data is not None}
     return load("ply", io.BytesIO(content), files, skip_materials=not files)
@@ -64,10 +64,10 @@ def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
     if not np.isfinite(mesh.vertices).all():
         mesh.remove_infinite_values()
     if (lost := faces - len(mesh.faces)) and len(mesh.faces):
-        warn(path, f"{lost} of {faces} triangles have corners at infinity or nowhere (NaN); they are left out")
+        warn(path, f"{lost} of {faces} triangles have infinite or undefined (NaN) corners; they are left out")
     uv = getattr(mesh.visual, "uv", None)
     if uv is not None and (lost := (~(np.abs(uv[mesh.faces]) < FARTHEST)).any(axis=(1, 2)).sum()):
-        warn(path, f"{lost} of {faces} triangles have no proper texture coordinates; they show the texture's corner")
+        warn(path, f"{lost} of {faces} triangles have no valid texture coordinates; they show the texture's corner")
     # glTF's vertices are distinct by its standard, others if they have their own colours.
     coloured = getattr(mesh.visual, "kind", None) == "vertex" or "color" in mesh.vertex_attributes
     if path.suffix.lower() not in (".gltf", ".glb") and not coloured:
@@ -94,5 +94,5 @@ def _left_out(mesh: trimesh.Trimesh) -> set[str]:
         eight_bit(image)
     unmapped = image is not None and getattr(mesh.visual, "uv", None) is None
     shines = light is not None and np.any(light)
-    found = {"transparency": clear, "light of their own": shines, "textures (it has no coordinates for them)": unmapped}
+    found = {"transparency": clear, "emitted light": shines, "textures (it has no coordinates for them)": unmapped}
     return {what for what, is_so in found.items() if is_so}

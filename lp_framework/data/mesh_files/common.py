@@ -67,7 +67,7 @@ def readable_image(data: bytes | None) -> bool:
 
 def warn_of_texture(path: Path, name: str) -> None:
     """Warn that a texture of the mesh file `path` cannot be drawn."""
-    missing = f"its texture {name} is not there or not a readable image; what it covers is drawn without it"
+    missing = f"its texture {name} is missing or not a readable image; what it covers is drawn without it"
     warn(path, missing, MissingColourWarning)
 
 

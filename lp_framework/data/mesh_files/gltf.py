@@ -79,7 +79,7 @@ class _File:
                 raise self._unsupported(next(iter(buffer["extensions"])))
             data = self._named(buffer["uri"]) if "uri" in buffer else chunk
             if data is None:
-                raise UserError(f"{path}: its file {buffer['uri']} is not there")
+                raise UserError(f"{path}: its file {buffer['uri']} is missing")
             self.buffers.append(data)
 
     def scene(self) -> trimesh.Scene:
@@ -101,7 +101,9 @@ class _File:
         return trimesh.load_scene(header, file_type="gltf", resolver=ZipResolver(files))
 
     def _unsupported(self, extension: str) -> UserError:
-        return UserError(f"{self.path}: needs the glTF extension {extension}, which is not supported; save it without")
+        return UserError(
+            f"{self.path}: needs the glTF extension {extension}, which is not supported; save it without that extension"
+        )
 
     def _named(self, uri: str) -> bytes | None:
         if uri.startswith("data:"):

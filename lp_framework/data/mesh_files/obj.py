@@ -59,7 +59,7 @@ def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     if not used and known:  # other viewers use the first
         used, text = {known[0]: None}, f"usemtl {known[0]}\n{text}"
     if None not in libraries and (unknown := [name for name in used if name not in known]):
-        warn(path, f"its material {' and '.join(unknown)} is in none of its material files", MissingColourWarning)
+        warn(path, f"its material {' and '.join(unknown)} is not in any of its material files", MissingColourWarning)
     materials, mappings, files = _with_textures(path, read, used, folders)
     scene = load("obj", io.StringIO(f"mtllib {MATERIALS}\n{text}"), {MATERIALS: materials, **files})
     for mesh in scene.geometry.values():
@@ -82,7 +82,7 @@ def _libraries(path: Path, text: str, folders: Sequence[Path]) -> list[Path | No
         for name in [names] if find(names, folders) else names.split():  # one name with spaces, or several names
             found.append(find(name, folders))
             if found[-1] is None:
-                warn(path, f"its material file {name} is not there", MissingColourWarning)
+                warn(path, f"its material file {name} is missing", MissingColourWarning)
     return found
 
 

@@ -138,7 +138,7 @@ def render_object(
     if folder.exists():
         changes, record = _changes(folder, protocol), read_record(folder / RECORD)
         if not changes and record.get("mesh") != made_from["mesh"]:
-            changes = "of another mesh, or by an earlier version's reading of it"
+            changes = "from another mesh, or by an earlier version"
         if changes:  # reported once if it is the same for several objects
             advice = "choose another folder of views or delete them"
             raise UserError(f"the views in {root} were rendered differently ({changes}); {advice}")
@@ -164,7 +164,7 @@ def render_object(
                 Image.fromarray(pixels).save(partial / split / "rgb" / name, compress_level=1)
                 if protocol.depth:
                     if depth is None:
-                        raise UserError(f"renderer={renderer.name} knows no depth; set data.depth=false")
+                        raise UserError(f"renderer={renderer.name} does not provide depth; set data.depth=false")
                     levels = np.rint(depth / DEPTH_UNIT).clip(0, 65535).astype(np.uint16)
                     Image.fromarray(levels).save(partial / split / "depth" / name, compress_level=1)
             placed = torch.from_numpy(poses)
@@ -181,7 +181,7 @@ def _changes(folder: Path, protocol: ViewProtocol) -> str:
     differ; existing depths that were not requested are ignored."""
     record = read_record(folder / RECORD)
     if not isinstance(record.get("protocol"), dict):
-        return f"it has no proper {RECORD}"
+        return f"it has no valid {RECORD}"
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
     return differences({**LATER, **record["protocol"]}, wanted)
 
@@ -229,7 +229,7 @@ def render_objects(
         except RuntimeError as error:
             if not str(error).startswith("DataLoader worker"):
                 raise
-            what = "a rendering process was killed, perhaps for lack of memory; what is finished is kept"
+            what = "a rendering process was killed, perhaps for lack of memory; finished views are kept"
             raise UserError(f"{what}, run the same command again with fewer workers") from error
     raise_failures(failures, len(todo), "rendered")
 

@@ -72,7 +72,7 @@ class Photograph:
     def _of_size(self, file: Path, image: Image.Image) -> Image.Image:
         if image.size != self.size:
             (width, height), (wide, high) = image.size, self.size
-            raise UserError(f"{file}: is {width} x {height} pixels, the photograph should be {wide} x {high}")
+            raise UserError(f"{file}: is {width} x {height} pixels, but the photograph should be {wide} x {high}")
         return image
 
 
@@ -114,13 +114,13 @@ class ConvertedSource(ViewSource):
                 except UserError as error:
                     failures[name] = str(error)
         listed = self.path / LIST
-        how = f"; mend them, or take their names out of {listed}" if listed.is_file() else ""
+        how = f"; repair them, or remove their names from {listed}" if listed.is_file() else ""
         raise_failures(failures, len(objects), f"converted{how}")
 
     def _write(self, name: str) -> None:
         folder = self.path / name
         if folder.exists():
-            others = f"holds other views than these files and settings make (see its {RECORD})"
+            others = f"holds views that were made from other files or settings (see its {RECORD})"
             raise UserError(f"{folder}: {others}; choose another data.views or delete it")
         with written_folder(folder) as partial:
             files, record = self.convert(name, partial)

@@ -168,7 +168,7 @@ def _unit(instances: Sequence[Instance], frame: ObjectFrame, name: str) -> float
         raise UserError(f"{name}: its masks show it {median[0]:.3g} times as long as its model is; {wanted}")
     unit = list(UNITS)[best]
     if unit != 1:
-        warnings.warn(f"{name}: taken are {UNITS[unit]}, as its masks show", stacklevel=2)
+        warnings.warn(f"{name}: assuming {UNITS[unit]}, as its masks show", stacklevel=2)
     return unit
 
 

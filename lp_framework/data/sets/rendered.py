@@ -69,7 +69,7 @@ def read_labels(path: Path, names: Collection[str], where: Path) -> dict[str, La
             f"{path}: object '{name}': {': '.join([*keys, first['msg']])}, got {first['input']!r}"
         ) from error
     if left_out := sorted(set(names) - set(labels)):
-        warnings.warn(f"{path}: leaves out, so that they stay unlabelled: {listed(left_out)}", stacklevel=2)
+        warnings.warn(f"{path}: has no label for {listed(left_out)}", stacklevel=2)
     return labels
 
 

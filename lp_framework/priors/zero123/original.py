@@ -61,9 +61,9 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
     tensors = read_state_dict(path)
     for key in tensors:
         if not key.startswith((UNET, VAE, VISUAL, PROJECTION)) and not LEFT_OVER.fullmatch(key):
-            raise UserError(f"{path}: is no Zero123 checkpoint: it holds an unknown tensor '{key}'")
+            raise UserError(f"{path}: is not a Zero123 checkpoint: it holds an unknown tensor '{key}'")
     if weights == "ema" and not any(key.startswith(EMA) for key in tensors):
-        raise UserError(f"{path}: holds no moving averages ({EMA}...); take the raw weights with weights=raw")
+        raise UserError(f"{path}: holds no moving averages ({EMA}...); use the raw weights with weights=raw")
     try:
         tensors[f"{PROJECTION}weight"]  # what other models of latent-diffusion lack
         configs = {"unet": _unet_sizes(tensors), "vae": _vae_sizes(tensors), "image_encoder": _clip_sizes(tensors)}
@@ -80,9 +80,9 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
             "cc_projection": projection,
         }
     except KeyError as error:
-        raise UserError(f"{path}: is no Zero123 checkpoint: it holds no '{error.args[0]}'") from error
+        raise UserError(f"{path}: is not a Zero123 checkpoint: it holds no '{error.args[0]}'") from error
     except (IndexError, ValueError) as error:  # tensors of too few or too many dimensions
-        raise UserError(f"{path}: is no Zero123 checkpoint: its tensors have other shapes") from error
+        raise UserError(f"{path}: is not a Zero123 checkpoint: its tensors have other shapes") from error
 
 
 def _renamed(tensors: Tensors, modules: Mapping[str, str]) -> dict[str, StoredTensor]:

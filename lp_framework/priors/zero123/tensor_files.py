@@ -88,7 +88,7 @@ def read_safetensors(path: Path) -> dict[str, StoredTensor]:
             for name, entry in header.items()
         }  # fmt: skip
     except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
-        raise UserError(f"{path}: is no safetensors file, or is cut short; download it again ({error})") from error
+        raise UserError(f"{path}: is not a safetensors file, or is cut short; download it again ({error})") from error
 
 
 def read_state_dict(path: Path) -> dict[str, StoredTensor]:
@@ -102,7 +102,9 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from error
     except zipfile.BadZipFile as error:
-        message = f"{path}: is no PyTorch checkpoint (a zip archive that torch.save wrote), or is cut short or damaged"
+        message = (
+            f"{path}: is not a PyTorch checkpoint (a zip archive that torch.save wrote), or is cut short or damaged"
+        )
         raise UserError(message) from error
     except Exception as error:  # a damaged pickle fails in any way
         raise UserError(f"{path}: its description of the tensors is damaged; download it again") from error
@@ -111,7 +113,7 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
     named = contents.items() if isinstance(contents, Mapping) else ()
     tensors = {str(name): value for name, value in named if isinstance(value, StoredTensor)}
     if not tensors:
-        raise UserError(f"{path}: holds no named tensors; a checkpoint with a 'state_dict' is wanted")
+        raise UserError(f"{path}: holds no named tensors; expected a checkpoint with a 'state_dict'")
     return tensors
 
 
@@ -161,7 +163,9 @@ class _Unpickler(pickle.Unpickler):
             return STORAGES[name]
         if STAND_INS.fullmatch(full):
             return type(name, (_StandIn,), {})
-        raise UserError(f"{self.path}: is refused, unpickling it would run '{full}'; a checkpoint of tensors is wanted")
+        raise UserError(
+            f"{self.path}: is refused, because unpickling it would run '{full}'; expected a checkpoint of tensors"
+        )
 
     def persistent_load(self, pid: Any) -> _Storage:
         _, dtype, key, _, _ = pid  # "storage", type, key, device, number of elements

@@ -71,8 +71,8 @@ def download(hub_id: str, revision: str | None) -> Path:
         except Exception:
             at = f" at revision {revision}" if revision else ""
             raise UserError(
-                f"{hub_id}: no such file or folder, and the Hugging Face hub does not give it{at} ({one_line(error)}); "
-                "give prior.path= a checkpoint file or a folder that you have"
+                f"{hub_id}: no such file or folder, and the Hugging Face hub does not provide it{at} "
+                f"({one_line(error)}); set prior.path to a checkpoint file or a folder that you have"
             ) from error
     return Path(folder)
 
@@ -93,7 +93,7 @@ def read_folder(path: Path) -> tuple[Configs, Weights]:
 def _weights(folder: Path) -> dict[str, StoredTensor]:
     file = next((folder / name for name in WEIGHT_FILES if (folder / name).is_file()), None)
     if file is None:
-        raise UserError(f"{folder}: holds no weights, none of {', '.join(WEIGHT_FILES)}")
+        raise UserError(f"{folder}: holds no weights; looked for {', '.join(WEIGHT_FILES)}")
     read = read_state_dict if file.suffix == ".bin" else read_safetensors
     files = [file]
     if file.suffix == ".json":  # the index of weights in several files
