@@ -194,7 +194,7 @@ def test_a_batch_of_pairs_fills_a_large_prior_and_no_more(monkeypatch, solver, s
 
 def test_poses_are_not_computed_in_less_than_float32(commands):
     ran = commands.here("half", "eval", "checkpoint=./score", "trainer.precision=bf16-mixed")
-    assert ran.error.startswith("trainer.precision: poses are computed in float32")
+    assert ran.error.startswith("trainer.precision must be 32-true, as poses are computed in float32")
 
 
 def test_errors_compare_the_querys_predicted_camera_with_its_true_one():

@@ -99,7 +99,7 @@ def test_chosen_objects_are_converted_alone(root, tmp_path):
 def test_a_folder_of_other_views_is_not_touched(root, data, tmp_path):
     write_object(tmp_path / "views", "dinosaur_002", train=2, test=2)
     data.evaluate_on("ordered", 0)
-    with pytest.raises(UserError, match=r"views/dinosaur_002: holds other views.*choose another data\.views"):
+    with pytest.raises(UserError, match=r"views/dinosaur_002: holds views that were made.*choose another data\.views"):
         data.prepare_data()
 
 
