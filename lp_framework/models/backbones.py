@@ -228,7 +228,7 @@ class ResNet(Backbone):
                 self.resnet.load_state_dict(weights.get_state_dict(progress=True, check_hash=True))
             except OSError as error:  # URLError among them
                 warnings.warn(
-                    f"the ImageNet weights of {arch} could not be loaded ({error}); training starts from random weights. "
+                    f"the ImageNet weights of {arch} did not load ({error}); training starts from random weights. "
                     f"Put {weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints to use them.",
                     stacklevel=2,
                 )
