@@ -238,6 +238,8 @@ def _pair_cameras_plot(pair: ShownPair) -> go.Figure:
 def _parts(pair: ShownPair) -> tuple[NDArray, NDArray]:
     """The ways `[_, S, 3]` of the other starts, and of the answer; of solvers that keep none, where they ended."""
     paths = pair.ends[:, None] if pair.trajectories is None else pair.trajectories
+    if not len(paths):  # no start came to a pose
+        paths = np.full((1, 1, 3), np.nan)
     chosen = pair.chosen or 0  # a pair that was saved has one
     return np.delete(paths, chosen, axis=0), paths[[chosen]]
 
