@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from lp_framework.data.photograph_files import as_counted
+
 KEPT_SECONDS = 3600.0  # after a visitor's last request
 
 
@@ -22,7 +24,7 @@ class Visitor:
 
     def take_photographs(self, files: Iterable[tuple[str, bytes]]) -> None:
         """Write photographs, names and contents, in place of those before."""
-        self.take_files(sorted(_written(self.new_folder(), files)))
+        self.take_files(sorted(_written(self.new_folder(), files), key=as_counted))
 
     def take_files(self, files: Sequence[Path]) -> None:
         """Take files of this machine in place of those before; masks go as well."""

@@ -94,10 +94,10 @@ def no_mask(file: Path, folder: str | Path) -> str:
 
 def _images_in(folder: Path) -> list[Path]:
     images = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.name[0] != "."]
-    return sorted(images, key=_as_counted)
+    return sorted(images, key=as_counted)
 
 
-def _as_counted(file: Path) -> tuple[list[int | str], str]:
+def as_counted(file: Path) -> tuple[list[int | str], str]:
     """Key for natural sorting of names: `2.png` before `10.png`."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.stem)], file.name
 
