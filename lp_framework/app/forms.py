@@ -9,6 +9,7 @@ import plotly.graph_objects as go
 import yaml
 from dash import ALL, MATCH, Dash, Input, Output, State, ctx, dcc, html, no_update
 from numpy.typing import NDArray
+from omegaconf import OmegaConf
 
 from lp_framework import catalogue
 from lp_framework.app.jobs import Jobs
@@ -52,13 +53,13 @@ def chosen(group: str, name: str, states: Sequence[Mapping[str, Any]]) -> Choice
     """A choice with the values of its inputs that are not those of its YAML file; `UserError` for what is no value."""
     own, settings = catalogue.values(group, name), {}
     for state in states:
-        key, text = state["id"]["setting"], state.get("value")
+        key, text = state["id"]["setting"], state["value"]
         try:
-            value = yaml.safe_load(str(text))
+            read: Any = OmegaConf.to_container(OmegaConf.create(f"{key}: {text}"))
         except yaml.YAMLError as error:
             raise UserError(f"{group}, {key}: '{text}' is no number, word or [list]") from error
-        if key in own and value != own[key]:
-            settings[key] = value
+        if key in own and read[key] != own[key]:
+            settings[key] = read[key]
     return Choice(name, settings)
 
 
