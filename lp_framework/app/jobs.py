@@ -15,7 +15,7 @@ from lp_framework.solvers.progress import progress_in
 
 log = logging.getLogger(__name__)
 
-KEPT = 64  # requests whose results can still be fetched
+KEPT = 256  # requests whose results can still be fetched
 
 
 class Cancelled(UserError):
@@ -75,23 +75,25 @@ class Jobs:
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lp-app")
-        self._jobs: OrderedDict[str, Job] = OrderedDict()
+        self._jobs: OrderedDict[str, Job] = OrderedDict()  # the one whose result was fetched last comes last
+        self._lock = threading.Lock()  # of the order
 
     def submit(self, work: Callable[[], Any]) -> str:
         """Queue a request; returns its name."""
         name, job = secrets.token_urlsafe(16), Job(work)
-        job.future = self._thread.submit(job.run)
-        self._jobs[name] = job
-        for old in [each for each, other in self._jobs.items() if other.future.done()][:-KEPT]:
-            del self._jobs[old]
+        with self._lock:
+            job.future = self._thread.submit(job.run)
+            self._jobs[name] = job
+            for old in [each for each, other in self._jobs.items() if other.future.done()][:-KEPT]:
+                del self._jobs[old]
         return name
 
     def now(self, work: Callable[[], Any]) -> Any:
         """Wait for a short request; its result, or what it raised."""
         return self.result(self.submit(work))
 
-    def cancel(self, name: str) -> None:
-        """End a request before its next step."""
+    def cancel(self, name: str | None) -> None:
+        """End a request, if there is one of that name, before its next step."""
         if name in self._jobs:
             self._jobs[name].cancelled = True
 
@@ -101,7 +103,8 @@ class Jobs:
         if job is None or job.future.done():
             return 1.0, ""
         if not job.future.running():
-            waiting = [each for each in self._jobs.values() if not each.future.done()].index(job)
+            with self._lock:
+                waiting = [each for each in self._jobs.values() if not each.future.done()].index(job)
             return 0.0, f"{waiting} request{'s' if waiting > 1 else ''} before this one"
         count = f" {job.done + 1} of {job.total}" if job.total else ""
         return job.share, f"{job.step}{count}" or "loading"
@@ -113,9 +116,12 @@ class Jobs:
     def result(self, name: str) -> Any:
         """What came of a request; raises `UserError` with a sentence for the visitor where nothing did."""
         if name not in self._jobs:
-            raise UserError("the app has been started again; please send the request once more")
+            raise UserError("the app no longer has the answer to this request; please send it once more")
         try:
-            return self._jobs[name].future.result()
+            found = self._jobs[name].future.result()
+            with self._lock:
+                self._jobs.move_to_end(name)
+            return found
         except UserError:
             raise
         except Exception as error:
