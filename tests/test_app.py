@@ -11,6 +11,7 @@ import time
 import warnings
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +29,14 @@ from lp_framework.analysis.pairs import PRIOR_ENERGY, ShownPair, View
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
+from lp_framework.report.plots import map_plot
 from lp_framework.solvers.progress import steps_of
 
 pytest.importorskip("dash")
 
 from lp_framework.app import forms
 from lp_framework.app.estimate import own_names, second_valley, warnings_of
+from lp_framework.app.explore import end_of
 from lp_framework.app.jobs import Cancelled, Jobs
 from lp_framework.app.server import make_app
 from lp_framework.app.visitors import Visitors
@@ -114,8 +117,18 @@ def test_what_goes_wrong_is_one_sentence_and_warnings_stay_with_their_request(jo
     assert (jobs.warnings(name), jobs.warnings(other)) == (["the border cuts the object off"], [])
     with pytest.raises(UserError, match="something went wrong"):
         jobs.now(breaks)
-    with pytest.raises(UserError, match="send the request once more"):
+    with pytest.raises(UserError, match="no longer has the answer to this request"):
         jobs.result("unknown")
+
+
+def test_answers_that_are_looked_at_stay(jobs: Jobs, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lp_framework.app.jobs.KEPT", 2)
+    scene, left = jobs.submit(lambda: "scene"), jobs.submit(lambda: "left")
+    for _ in range(5):
+        jobs.now(lambda: None)
+        assert jobs.result(scene) == "scene"
+    with pytest.raises(UserError):
+        jobs.result(left)
 
 
 # ---------------------------------------------------------------- files of visitors
@@ -127,6 +140,8 @@ def test_uploads_stay_in_the_visitors_folder_and_go_with_the_app() -> None:
     one.take_photographs([("../../evil.png", b"1"), ("C:\\photos\\b.png", b"2"), ("..", b"3")])
     assert [file.name for file in one.files] == ["b.png", "evil.png", "image"]
     assert all(file.is_relative_to(one.folder) and not file.is_relative_to(other.folder) for file in one.files)
+    other.take_photographs([("10.png", b"1"), ("2.png", b"2")])
+    assert [file.name for file in other.files] == ["2.png", "10.png"]
     assert visitors["one"] is one
     text = f"{one.files[0]}: is not a readable image"
     assert own_names(text, one.folder) == "b.png: is not a readable image"
@@ -163,6 +178,7 @@ def test_only_changed_settings_are_passed_on() -> None:
     own = states(alpha="0.1", gamma="[0.0, 0.3, 0.0]", iterations="20", choose_by="null")
     assert forms.chosen("solver", "langevin", own) == Choice("langevin", {"iterations": 20})
     assert forms.chosen("solver", "langevin", states(sigma="[1.0, 0.2]")).settings == {"sigma": [1.0, 0.2]}
+    assert forms.chosen("solver", "langevin", states(alpha="1e-3")).settings == {"alpha": 0.001}
     with pytest.raises(UserError, match=r"solver, alpha: '\[1' is no number"):
         forms.chosen("solver", "langevin", states(alpha="[1"))
 
@@ -233,6 +249,16 @@ def test_a_solver_that_refuses_a_start_leaves_the_others(bench: Workbench) -> No
     place = bench.place(scene, [0.0, 0.0, -1.5], ["ifusion", "langevin"])
     assert list(place.ways) == ["langevin"]
     assert "starts with relative radii between" in place.refusals["ifusion"]
+    nothing = replace(place.ways["langevin"], ends=np.full((1, 3), np.nan))
+    assert end_of(nothing) == ("no pose", "", "")
+
+
+def test_an_answer_to_all_photographs_at_once_is_drawn_too(bench: Workbench, photographs: list[Path]) -> None:
+    fast = Choice("multiview", {"iterations": 1, "refinement_steps": 1})
+    found, pairs = bench.estimate(photographs, None, True, replace(PAPER, solver=fast))
+    for pair, relative in zip(pairs, found.relative[1:], strict=True):
+        assert np.allclose(pair.ends[pair.chosen], relative)
+        assert map_plot(pair.arrived()).data
 
 
 def test_one_model_is_in_memory_at_a_time(bench: Workbench) -> None:
@@ -284,9 +310,12 @@ def address(bench: Workbench, tmp_path_factory: pytest.TempPathFactory) -> Itera
     runs = tmp_path_factory.mktemp("runs")
     (runs / "eval" / "first").mkdir(parents=True)
     (runs / "eval" / "first" / "report.html").write_text("<h1>the first run</h1>")
+    (runs / "eval" / "lr=1, #2").mkdir()
+    (runs / "eval" / "lr=1, #2" / "report.html").write_text("<h1>the second run</h1>")
     (runs / "secret.txt").write_text("secret")
+    views = {"cup": 4, "tram": 4, "vase": 2}
     jobs, visitors = Jobs(), Visitors()
-    server = make_server("127.0.0.1", 0, make_app(bench, jobs, visitors, "tram", 4, runs, 20).server, threaded=True)
+    server = make_server("127.0.0.1", 0, make_app(bench, jobs, visitors, "tram", views, runs, 1).server, threaded=True)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     yield f"http://127.0.0.1:{server.port}"
@@ -347,6 +376,14 @@ def test_two_visitors_get_their_own_answers_and_files(visit: Any, photographs: l
         one.click("#estimate-download")
     names = zipfile.ZipFile(io.BytesIO(Path(download.value.path()).read_bytes())).namelist()
     assert {"cameras/transforms.json", "cameras/images/000.png", "cameras/report.html"} <= set(names)
+    one.click("#tab-Estimate summary:has-text('Method')")
+    one.click("#tab-Estimate .field:has(> label:text-is('Solver')) .dash-dropdown")
+    one.click(".dash-dropdown-option:has-text('features')")
+    one.click("#estimate-run")  # without a network there is no landscape, and least of all the one before
+    one.wait_for_selector("#estimate-landscapes", state="hidden")
+    one.click("#estimate-clear")
+    one.wait_for_selector("#estimate-words", state="hidden")
+    assert one.locator("#thumbnails img").count() == 0
 
 
 @with_browser
@@ -358,6 +395,34 @@ def test_a_wrong_file_is_answered_in_a_sentence(visit: Any, photographs: list[Pa
     send(page, tmp_path / "notes.png", photographs[0])
     page.wait_for_selector("#estimate-error:has-text('notes.png: is not a readable image')")
     assert "lp-app" not in page.inner_text("#estimate-error")
+    noise = Image.frombytes("RGB", (800, 700), np.random.default_rng(0).bytes(3 * 800 * 700))
+    noise.save(tmp_path / "large.bmp")
+    send(page, tmp_path / "large.bmp", photographs[0])
+    page.wait_for_selector("#estimate-error:has-text('larger than 1 MB together')")
+    send(page, *photographs[:2])
+    page.wait_for_selector("#thumbnails img >> nth=1")
+    assert page.inner_text("#estimate-error") == ""
+
+
+@with_browser
+def test_the_choices_are_those_that_there_are(visit: Any) -> None:
+    page = visit()
+    page.click("summary:has-text('Method')")
+    assert options(page, "#estimate-checkpoint") == ["general", "score"]
+    page.click("text=Explore")
+    assert options(page, "#explore-query") == ["0", "1", "2", "3"]
+    page.click("#explore-object")
+    page.click(".dash-dropdown-option:has-text('vase')")
+    page.wait_for_selector("#explore-query:has-text('1')")
+    assert options(page, "#explore-query") == ["0", "1"]
+
+
+def options(page: Any, dropdown: str) -> list[str]:
+    page.click(dropdown)
+    page.wait_for_selector(".dash-dropdown-option")
+    found = [each.inner_text().strip() for each in page.locator(".dash-dropdown-option").all()]
+    page.keyboard.press("Escape")
+    return found
 
 
 @with_browser
@@ -397,9 +462,10 @@ def place(page: Any) -> tuple[int, int]:
 def test_pages_of_runs_are_served_and_nothing_else(visit: Any, address: str) -> None:
     page = visit()
     page.click("text=Runs")
-    with page.expect_popup() as popup:
-        page.click("text=eval/first")
-    assert popup.value.inner_text("h1") == "the first run"
+    for name, heading in (("first", "the first run"), ("lr=1, #2", "the second run")):
+        with page.expect_popup() as popup:
+            page.click(f"text=eval/{name}")
+        assert popup.value.inner_text("h1") == heading
     for path in ("secret.txt", "eval/..%2f..%2fsecret.txt", "eval/none/report.html"):
         assert page.request.get(f"{address}/runs/{path}").status == 404
 
@@ -409,6 +475,12 @@ def test_the_command_without_dash_says_how_to_get_it(lp: Any, monkeypatch: pytes
     ran = lp("app", "port=0")
     assert ran.status == 1
     assert "pip install 'lp_framework[app]'" in ran.error
+
+
+def test_a_limit_that_is_no_number_is_refused(lp: Any) -> None:
+    ran = lp("app", "upload_megabytes=0")
+    assert ran.status == 1
+    assert "upload_megabytes must be a positive number, got 0" in ran.error
 
 
 def test_a_port_in_use_is_named(lp: Any) -> None:

@@ -9,10 +9,11 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from dash import Dash, Input, Output, State, ctx, dcc, html, no_update
+from dash.dcc.express import send_bytes
 
 from lp_framework import catalogue
 from lp_framework.analysis.confidence import Answer, in_words
@@ -29,7 +30,7 @@ from lp_framework.report.estimate_files import write_estimate
 from lp_framework.report.plots import cameras_plot, map_plot, surface_plot
 
 TAB = "estimate"
-EXAMPLE_VIEWS = (0, 1, 2)  # test views of an object that are an example
+EXAMPLE_VIEWS = 3  # test views of an object that are an example, the first ones
 BACKGROUNDS = {
     "cut": "Cut the object out: by its mask, by transparency, or else automatically",
     "white": "Take the images as they are: square, with the object on white",
@@ -37,14 +38,15 @@ BACKGROUNDS = {
 NEARLY_AS_DEEP = 0.1  # of the landscape's range: a valley no higher than this above the deepest one is worth a warning
 
 
-class Result:
+class Result(NamedTuple):
     """An estimate as the tab shows it: the numbers, the pairs with their landscapes, and the folder of the files."""
 
-    def __init__(self, found: Estimate, pairs: Sequence[ShownPair], folder: Path) -> None:
-        self.found, self.pairs, self.folder = found, pairs, folder
+    found: Estimate
+    pairs: Sequence[ShownPair]
+    folder: Path
 
 
-def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str, megabytes: float) -> html.Div:
+def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str) -> html.Div:
     """The tab; `objects` are ready examples."""
     drop: list[Any] = ["Drop two or more photographs of one object here, or ", html.A("choose files", href="#")]
     masks: list[Any] = [html.A("Add masks", href="#"), " of the same names, if there are any"]
@@ -64,15 +66,18 @@ def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str, megab
         forms.field("Pair", dcc.Dropdown(id="estimate-pair", clearable=False)),
         forms.field("Landscape", dcc.Dropdown(id="estimate-landscape", clearable=False)),
     ]
+    landscapes = [
+        html.H3("The landscape, with the trajectories of all starts"),
+        html.Div(choose, className="form"),
+        html.Div([forms.plot("estimate-map", 400), forms.plot("estimate-surface", 400)], className="plots"),
+    ]
     shown = [
         html.Div(id="estimate-words"),
         html.Button("Download everything", id="estimate-download", className="quiet"),
         dcc.Download(id="estimate-files"),
         html.H3("The cameras around the object"),
         forms.plot("estimate-cameras", 420),
-        html.H3("The landscape, with the ways of all starts"),
-        html.Div(choose, className="form"),
-        html.Div([forms.plot("estimate-map", 400), forms.plot("estimate-surface", 400)], className="plots"),
+        html.Div(landscapes, id="estimate-landscapes"),
     ]
     return html.Div(
         [
@@ -101,6 +106,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
         Output("example", "value"),
         Output("photographs", "contents"),
         Output("masks", "contents"),
+        Output("estimate-shown", "hidden", allow_duplicate=True),
         Input("photographs", "contents"),
         Input("masks", "contents"),
         Input("example", "value"),
@@ -108,9 +114,12 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
         State("photographs", "filename"),
         State("masks", "filename"),
         State("visitor", "data"),
+        State(f"{TAB}-job", "data"),
         prevent_initial_call=True,
     )
-    def take(photographs: Any, masks: Any, example: str | None, _: Any, names: Any, mask_names: Any, name: str) -> Any:
+    def take(
+        photographs: Any, masks: Any, example: str | None, _: Any, names: Any, mask_names: Any, name: str, job: str
+    ) -> Any:
         visitor, what = visitors[name], ctx.triggered_id
         try:
             if what == "estimate-clear":
@@ -122,11 +131,12 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
             elif what == "masks" and masks:
                 visitor.take_masks(_decoded(mask_names, masks))
             else:  # what a callback has emptied
-                return [no_update] * 5
-            return _thumbnails(visitor), "", example if what == "example" else None, None, None
+                return [no_update] * 6
+            jobs.cancel(job)
+            return _thumbnails(visitor), "", example if what == "example" else None, None, None, True
         except UserError as error:
             visitor.take_files([])
-            return [], own_names(str(error), visitor.folder), None, None, None
+            return [], own_names(str(error), visitor.folder), None, None, None, True
 
     @app.callback(
         Output(f"{TAB}-job", "data"),
@@ -136,10 +146,11 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
         State("background", "value"),
         State("estimate-checkpoint", "value"),
         State("visitor", "data"),
+        State(f"{TAB}-job", "data"),
         *forms.selected(TAB),
         prevent_initial_call=True,
     )
-    def run(_: int, background: str, checkpoint: str, name: str, *__: Any) -> Any:
+    def run(_: int, background: str, checkpoint: str, name: str, last: str, *__: Any) -> Any:
         visitor = visitors[name]
         try:
             made = forms.choices()
@@ -151,8 +162,10 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
             def work() -> Result:
                 found, pairs = bench.estimate(files, masks, background == "cut", request)
                 write_estimate(folder, found, {})
-                return Result(found, pairs, folder)
+                # Of the photographs, which are large, the prepared ones are shown.
+                return Result(replace(found, photographs=()), pairs, folder)
 
+            jobs.cancel(last)
             return jobs.submit(work), "", True
         except UserError as error:
             return no_update, str(error), True
@@ -166,6 +179,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
         Output("estimate-pair", "value"),
         Output("estimate-landscape", "options"),
         Output("estimate-landscape", "value"),
+        Output("estimate-landscapes", "hidden"),
         Input(f"{TAB}-done", "data"),
         State("visitor", "data"),
         prevent_initial_call=True,
@@ -174,7 +188,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
         try:
             result: Result = jobs.result(job)
         except UserError as error:
-            return own_names(str(error), visitors[name].folder), True, *[no_update] * 6
+            return own_names(str(error), visitors[name].folder), True, *[no_update] * 7
         found = result.found
         sound = np.isfinite(found.absolute.numpy()).all(axis=1)
         images = [np.asarray(each.image) for each, kept in zip(found.prepared, sound, strict=True) if kept]
@@ -190,6 +204,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
             0,
             names,
             names[0] if names else None,
+            not names,  # of a solver without a model and a prior
         )
 
     @app.callback(
@@ -212,16 +227,16 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
 
     @app.callback(
         Output("estimate-files", "data"),
+        Output("estimate-error", "children", allow_duplicate=True),
         Input("estimate-download", "n_clicks"),
         State(f"{TAB}-done", "data"),
         prevent_initial_call=True,
     )
     def download(_: int, job: str) -> Any:
-        return {
-            "content": base64.b64encode(_archive(jobs.result(job).folder)).decode(),
-            "filename": "cameras.zip",
-            "base64": True,
-        }
+        try:
+            return send_bytes(_archive(jobs.result(job).folder), "cameras.zip"), ""
+        except UserError as error:
+            return no_update, str(error)
 
 
 def _decoded(names: Sequence[str], contents: Sequence[str]) -> list[tuple[str, bytes]]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import cycle
 from typing import Any
 
 import plotly.graph_objects as go
@@ -26,15 +27,15 @@ COLOURS = ("#E6399B", "#17A398", "#7B5CD6", "#D08700", "#3E8EDE", "#8A8D91")  # 
 FIRST, SECOND = 0, 4  # the views that are shown at first, as by `landscape`
 
 
-def layout(objects: Sequence[str], first: str, views: int, checkpoints: Sequence[str], prior: str) -> html.Div:
-    """The tab; `objects` can be chosen, with so many test views each, and the `first` is at first."""
-    numbers, solvers = list(range(views)), catalogue.choices("solver")
-    names = [{"label": words(each), "value": each} for each in objects]
-    chosen = first if first in objects else objects[0]
+def layout(views: Mapping[str, int], first: str, checkpoints: Sequence[str], prior: str) -> html.Div:
+    """The tab; objects with so many test `views` each can be chosen, and the `first` is at first."""
+    names = [{"label": words(each), "value": each} for each in views]
+    chosen, solvers = first if first in views else next(iter(views)), catalogue.choices("solver")
+    numbers = list(range(views[chosen]))
     pair = [
         forms.field("Object", dcc.Dropdown(names, chosen, id="explore-object", clearable=False)),
         forms.field("Reference view", dcc.Dropdown(numbers, FIRST, id="explore-reference", clearable=False)),
-        forms.field("Query view", dcc.Dropdown(numbers, min(SECOND, views - 1), id="explore-query", clearable=False)),
+        forms.field("Query view", dcc.Dropdown(numbers, min(SECOND, numbers[-1]), id="explore-query", clearable=False)),
         html.Button("Show the landscape", id="explore-show", className="main"),
     ]
     method = [
@@ -71,11 +72,25 @@ def layout(objects: Sequence[str], first: str, views: int, checkpoints: Sequence
     )
 
 
-def register(app: Dash, jobs: Jobs, bench: Workbench) -> None:
+def register(app: Dash, jobs: Jobs, bench: Workbench, views: Mapping[str, int]) -> None:
     """The tab's callbacks."""
     for name in ("explore-map", "explore-surface"):
         forms.register_plot(app, name)
     forms.register_progress(app, jobs, TAB)
+
+    @app.callback(
+        Output("explore-reference", "options"),
+        Output("explore-query", "options"),
+        Output("explore-reference", "value"),
+        Output("explore-query", "value"),
+        Input("explore-object", "value"),
+        State("explore-reference", "value"),
+        State("explore-query", "value"),
+        prevent_initial_call=True,
+    )
+    def number(name: str, reference: int, query: int) -> Any:
+        numbers = list(range(views[name]))
+        return numbers, numbers, min(reference, numbers[-1]), min(query, numbers[-1])
 
     @app.callback(
         Output(f"{TAB}-job", "data"),
@@ -88,6 +103,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench) -> None:
         State("explore-reference", "value"),
         State("explore-query", "value"),
         State("explore-checkpoint", "value"),
+        State(f"{TAB}-job", "data"),
         *forms.selected(TAB),
         prevent_initial_call=True,
     )
@@ -100,8 +116,10 @@ def register(app: Dash, jobs: Jobs, bench: Workbench) -> None:
         reference: int,
         query: int,
         checkpoint: str,
+        last: str,
         *__: Any,
     ) -> Any:
+        jobs.cancel(last)
         try:
             if ctx.triggered_id == "explore-at":
                 known = jobs.result(scene)
@@ -149,8 +167,11 @@ def register(app: Dash, jobs: Jobs, bench: Workbench) -> None:
     def draw(landscape: str | None, way: str | None, scene: str | None) -> Any:
         if landscape is None or scene is None:
             return no_update, no_update
-        known = jobs.result(scene)
-        return tuple(map(forms.for_page, figures(known, landscape, jobs.result(way) if way else None)))
+        try:
+            known, place = jobs.result(scene), jobs.result(way) if way else None
+        except UserError:
+            return no_update, no_update
+        return tuple(map(forms.for_page, figures(known, landscape, place)))
 
     @app.callback(
         Output("explore-latitude", "value"),
@@ -181,7 +202,7 @@ def figures(scene: Scene, landscape: str, place: Place | None) -> tuple[go.Figur
     relief = scene.pair.landscapes[landscape]
     pair = replace(scene.pair, landscapes={landscape: relief})
     seen, raised = map_plot(pair), surface_plot(pair)
-    for (name, way), colour in zip(place.ways.items() if place else (), COLOURS, strict=False):
+    for (name, way), colour in zip(place.ways.items() if place else (), cycle(COLOURS), strict=False):
         path = way.ends if way.trajectories is None else way.trajectories[0]
         add_way(seen, path, words(name), colour)
         add_way(raised, path, words(name), colour, relief)
@@ -201,10 +222,10 @@ def _place(place: Place) -> list[Any]:
     latitude, longitude, radius = place.pose
     head = f"Latitude {math.degrees(latitude):.0f}°, longitude {math.degrees(longitude):.0f}°, radius {radius:.2f}"
     energies = [f"{name}: {value:.4g}" for name, value in place.energies.items()]
-    ends = {name: _end(way) for name, way in place.ways.items()}
+    ends = {name: end_of(way) for name, way in place.ways.items()}
     rows = [
         html.Tr([html.Th([html.I(style={"background": colour}), words(name)]), *map(html.Td, end)])
-        for (name, end), colour in zip(ends.items(), COLOURS, strict=False)
+        for (name, end), colour in zip(ends.items(), cycle(COLOURS), strict=False)
     ]
     rows += [html.Tr([html.Th(words(name)), html.Td(why, colSpan=3)]) for name, why in place.refusals.items()]
     heads = ("a start from there, by", "ends", "from the truth", "its energy")
@@ -214,12 +235,13 @@ def _place(place: Place) -> list[Any]:
             html.Tbody(rows),
         ]
     )
-    told = [html.P("; ".join(energies)), html.Div(table, className="scrolls")]
-    return [html.H3(head.replace("-", "\N{MINUS SIGN}")), *told]
+    told = [html.H3(head.replace("-", "\N{MINUS SIGN}")), html.P("; ".join(energies))]
+    return [*told, html.Div(table, className="scrolls")] if rows else told
 
 
-def _end(way: ShownPair) -> tuple[str, str, str]:
+def end_of(way: ShownPair) -> tuple[str, str, str]:
     """Where a way ends, how far that is from the truth, and the solver's energy there."""
+    way = way.arrived()
     number = way.chosen
     if number is None:
         return "no pose", "", ""

@@ -94,7 +94,7 @@ class Jobs:
 
     def cancel(self, name: str | None) -> None:
         """End a request, if there is one of that name, before its next step."""
-        if name in self._jobs:
+        if name is not None and name in self._jobs:
             self._jobs[name].cancelled = True
 
     def state(self, name: str) -> tuple[float, str]:

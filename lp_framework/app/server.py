@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 from dash import Dash, Input, Output, dcc, html
 from flask import Response, abort, send_from_directory
@@ -13,7 +16,7 @@ from lp_framework.app import estimate, explore, forms
 from lp_framework.app.jobs import Jobs
 from lp_framework.app.visitors import Visitors
 from lp_framework.app.workbench import Workbench
-from lp_framework.models.checkpoints import SHIPPED
+from lp_framework.models.checkpoints import SHIPPED, WEIGHTS
 from lp_framework.report.page import PAGE
 
 MOST_RUNS = 200  # pages that are listed, the latest first
@@ -38,20 +41,21 @@ HTML = """<!DOCTYPE html>
 
 
 def make_app(
-    bench: Workbench, jobs: Jobs, visitors: Visitors, first: str, views: int, runs: Path, megabytes: float
+    bench: Workbench, jobs: Jobs, visitors: Visitors, first: str, views: Mapping[str, int], runs: Path, megabytes: float
 ) -> Dash:
-    """The app; `runs` is the folder whose pages are shown, `megabytes` the most that one visitor may send at once."""
+    """The app; `views` are the numbers of test views by object, of which `first` is shown first, `runs` is the folder
+    whose pages are shown, `megabytes` the most that one visitor may send at once."""
     app = Dash("lp_framework", title="lp_framework", update_title="", assets_folder="")
     style = _text("report/templates/page.css") + _text("app/app.css")
     app.index_string = HTML.format(style=style, script=_text("app/app.js"))
     app.server.config["MAX_CONTENT_LENGTH"] = int(megabytes * 2**20 * 1.4)  # in letters of base64
-    objects, prior = bench.data.source.names(), bench.own_prior.name
-    checkpoints = sorted(folder.name for folder in SHIPPED.iterdir() if folder.name != "tiny")
+    prior = bench.own_prior.name
+    checkpoints = sorted(file.parent.name for file in SHIPPED.glob(f"*/{WEIGHTS}") if file.parent.name != "tiny")
 
     def page() -> html.Div:
         tabs = {
-            "Estimate": estimate.layout(objects, checkpoints, prior, megabytes),
-            "Explore": explore.layout(objects, first, views, checkpoints, prior),
+            "Estimate": estimate.layout(list(views), checkpoints, prior),
+            "Explore": explore.layout(views, first, checkpoints, prior),
             "Runs": _runs(runs),
         }
         names = [dcc.Tab(label=name, value=name) for name in tabs]
@@ -79,7 +83,14 @@ def make_app(
     )
     forms.register_choices(app)
     estimate.register(app, jobs, bench, visitors)
-    explore.register(app, jobs, bench)
+    explore.register(app, jobs, bench, views)
+
+    @app.server.errorhandler(413)
+    def too_large(_: Exception) -> dict[str, Any]:
+        """The answer to an upload, as Dash has answers, in place of that of its callback."""
+        sentence = f"these files are larger than {megabytes:g} MB together; send fewer or smaller ones"
+        emptied = {part: {"contents": None} for part in ("photographs", "masks")}
+        return {"multi": True, "response": {"estimate-error": {"children": sentence}, **emptied}}
 
     @app.server.route("/runs/<path:file>")
     def run_page(file: str) -> Response:
@@ -92,7 +103,8 @@ def _runs(folder: Path) -> html.Div:
     """Links to the pages of finished runs, the latest first."""
     pages = sorted(folder.rglob(PAGE), key=lambda file: file.stat().st_mtime, reverse=True)[:MOST_RUNS]
     links = [
-        html.Li(html.A(str(page.parent), href=f"/runs/{page.relative_to(folder)}", target="_blank")) for page in pages
+        html.Li(html.A(str(page.parent), href=f"/runs/{quote(page.relative_to(folder).as_posix())}", target="_blank"))
+        for page in pages
     ]
     none = html.P(f"There is no finished run with a page in {folder}.", className="note")
     return html.Div(html.Ul(links, className="runs") if links else none)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -54,12 +55,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Scene:
-    """A pair that is explored, on a device and as arrays with its landscapes, and what made them."""
+    """A pair that is explored, on a device and as arrays with its landscapes, and what was asked for."""
 
     pairs: Pairs
     pair: ShownPair
-    prior: Prior
-    model: PoseModel
     request: Request
 
 
@@ -92,19 +91,21 @@ class Workbench:
         solver, starts, needs = *self._solver(request), self._needs(request)
         prior = self._prior(request.prior) if "prior" in needs else None
         found = estimate(photographs, crop, solver, starts, prior, self.first, self.device, self.seed)
-        shown = list(found.shown)
+        shown = [
+            pair if len(pair.ends) else _answered(pair, pose.numpy())
+            for pair, pose in zip(found.shown, found.relative[1:], strict=True)
+        ]
         if "model" in needs:
             shown = with_model_landscape(found.pairs, shown, self._model(request.checkpoint), sigma_of(solver))
         if prior is not None:
             shown = with_prior_energy(found.pairs, shown, prior, self.draws)
         return found, shown
 
-    def example(self, name: str, views: Sequence[int]) -> list[Path]:
-        """The files of some test views of an object."""
+    def example(self, name: str, count: int) -> list[Path]:
+        """The files of the first test views of an object."""
         self.data.prepare_data()
         table = self.data.table("test")
-        numbers = table.views_of(object_index(self.data, name))
-        return [table.files[numbers[view]] for view in views]
+        return [table.files[view] for view in table.views_of(object_index(self.data, name))[:count]]
 
     def scene(self, name: str, reference: int, query: int, request: Request) -> Scene:
         """A pair of test views of an object with both landscapes, and where the solver goes from the starts."""
@@ -115,22 +116,25 @@ class Workbench:
         shown = with_prior_energy(pairs, shown, prior, self.draws)
         shown = with_model_landscape(pairs, shown, model, sigma_of(solver))
         (pair,) = solved_pairs(pairs, shown, solver, starts.make(pairs, self.seed), self.seed)
-        return Scene(pairs, pair.arrived(), prior, model, request)
+        return Scene(pairs, pair.arrived(), request)
 
     @torch.no_grad()
     def place(self, scene: Scene, pose: Sequence[float], solvers: Sequence[str]) -> Place:
         """What there is at a relative pose (radians, object sizes) of a scene."""
         here = torch.tensor([[pose]], dtype=torch.float32, device=self.device)  # [B = 1, N = 1, 3]
         pairs, grid = scene.pairs, (here[0, :, 0].cpu(), here[0, :, 1].cpu())
-        code = scene.prior.encode(pairs.images[pairs.reference])
-        (view,) = generated_views(scene.prior, code, here[0].cpu(), *SAMPLING, self.seed)
-        score, energy = model_field(scene.model, pairs, here[0, :, 2], grid, sigma_of(self._solver(scene.request)[0]))
-        values = pose_energies(scene.prior, pairs, here, self.draws), score.norm(dim=-1) if energy is None else energy
+        prior, model = self._prior(scene.request.prior), self._model(scene.request.checkpoint)
+        code = prior.encode(pairs.images[pairs.reference])
+        (view,) = generated_views(prior, code, here[0].cpu(), *SAMPLING, self.seed)
+        score, energy = model_field(model, pairs, here[0, :, 2], grid, sigma_of(self._solver(scene.request)[0]))
+        values = pose_energies(prior, pairs, here, self.draws), score.norm(dim=-1) if energy is None else energy
         energies = {name: value.item() for name, value in zip(scene.pair.landscapes, values, strict=True)}
         ways, refusals = {}, {}
         for solver in solvers:
             try:
-                chosen, _ = self._solver(replace(scene.request, solver=Choice(solver)))
+                own = scene.request.solver
+                choice = own if solver == own.name else Choice(solver)
+                chosen, _ = self._solver(replace(scene.request, solver=choice))
                 (ways[solver],) = solved_pairs(pairs, [scene.pair], chosen, here, self.seed)
             except Cancelled:
                 raise
@@ -170,6 +174,14 @@ class Workbench:
             self._held[kind] = key, load()
         found: T = self._held[kind][1]
         return found
+
+
+def _answered(pair: ShownPair, pose: NDArray) -> ShownPair:
+    """A pair of photographs with its answer `[3]` alone, as of solvers that take all photographs at once."""
+    unknown = np.full(1, np.nan)
+    return replace(
+        pair, ends=pose[None], chosen=0, energies=unknown, rotation_errors=unknown, translation_errors=unknown
+    )
 
 
 def component_names(group: str, choice: Choice) -> list[str]:

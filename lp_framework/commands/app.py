@@ -27,6 +27,9 @@ def run(config: DictConfig) -> None:
     from lp_framework.app.visitors import Visitors
     from lp_framework.app.workbench import Choice, Workbench
 
+    most = config.upload_megabytes
+    if not isinstance(most, int | float) or not most > 0:
+        raise UserError(f"upload_megabytes must be a positive number, got {most}")
     _, device, components = begin(config)
     data = components["data"]
     data.evaluate_on("ordered", config.seed)
@@ -35,8 +38,9 @@ def run(config: DictConfig) -> None:
     draws = Draws(TIMESTEPS, noises=1, seed=config.seed)
     bench = Workbench(device, data, Choice(settings.pop("name"), settings), draws, first, config.seed)
     jobs, visitors = Jobs(), Visitors()
-    views = config.data.get("test_views", 2)
-    app = make_app(bench, jobs, visitors, config.object, views, Path(config.folder), config.upload_megabytes)
+    planned = config.data.get("test_views")  # None: the views are there already
+    views = {name: planned or len(data.source.views(name, "test")) for name in data.source.names()}
+    app = make_app(bench, jobs, visitors, config.object, views, Path(config.folder), most)
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line for each request
     try:
         listening = socket.create_server((config.host, config.port))
