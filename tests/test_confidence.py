@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 from toy_views import toy_view
 
-from lp_framework.analysis.confidence import DOUBT, TRUST, Answer, answers, answers_by_prior, in_words
+from lp_framework.analysis.confidence import DOUBT, TRUST, Answer, answers, answers_by_prior, denoising_errors, in_words
 from lp_framework.api import load_prior, view_set
 from lp_framework.data.rendering.raycast import RaycastRenderer
 from lp_framework.geometry import camera_to_world
@@ -100,5 +100,7 @@ def test_a_prior_tells_objects_that_it_knows_from_others(recoloured, verdict):
     true = torch.deg2rad(torch.tensor([[-17.0, 52.0, 0.0]]))
     (answer,) = answers_by_prior(prior, pairs, true)
     assert answer.verdict == verdict and "what it is for objects that the prior knows" in answer.reason
+    error = denoising_errors(prior, pairs, true).item()
+    assert answer.strangeness == pytest.approx(error / prior.usual_error)
     prior.usual_error = None
     assert answers_by_prior(prior, pairs, true) == []

@@ -8,9 +8,11 @@ import pytest
 import torch
 from zero123_checkpoint import write_checkpoint
 
+from lp_framework.analysis.confidence import answers_by_prior, denoising_errors
 from lp_framework.errors import UserError
 from lp_framework.priors.ddim import ddim_step, ddim_timesteps, scaled_linear_alphas
 from lp_framework.priors.zero123.prior import Chunks, Zero123, conditioning_vector
+from lp_framework.solvers.base import Pairs
 
 SIDE = 8  # of the latents in tests where any will do: the networks are convolutional
 
@@ -284,3 +286,18 @@ def test_ddim_with_eta_one_has_the_variance_of_the_posterior():
         step = [ddim_step(zero, zero, alphas[t], alphas[t - 1], 1.0, fresh) for fresh in (zero, one)]
         beta_tilde = (1 - alphas[t - 1]) / (1 - alphas[t]) * (1 - alphas[t] / alphas[t - 1])
         torch.testing.assert_close((step[1] - step[0]).square(), beta_tilde[None])
+
+
+def test_answers_get_a_verdict_once_the_usual_error_is_given(checkpoint):
+    images = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    pairs = Pairs(images, *torch.tensor([[0], [1], [0]]))
+    poses = torch.tensor([[0.1, 0.5, 0.0]])
+    prior = small(Zero123(checkpoint))
+    assert answers_by_prior(prior, pairs, poses) == []
+    (error,) = denoising_errors(prior, pairs, poses).tolist()
+    for share, verdict in ((0.9, "trust"), (0.4, "doubtful"), (0.3, "do not trust")):
+        judged = small(Zero123(checkpoint, usual_error=share * error))
+        (answer,) = answers_by_prior(judged, pairs, poses)
+        assert (answer.verdict, answer.strangeness) == (verdict, pytest.approx(1 / share, rel=1e-5))
+    with pytest.raises(UserError, match=r"prior.usual_error must be positive, got 0"):
+        Zero123(checkpoint, usual_error=0.0)

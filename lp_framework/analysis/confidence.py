@@ -90,15 +90,22 @@ def answers_by_prior(prior: Prior, pairs: Pairs, poses: Tensor) -> list[Answer]:
     """Answers `poses` `[B, 3]` to pairs with their strangeness to the prior; empty where its usual error is unknown."""
     if prior.usual_error is None:
         return []
-    energy = PairEnergy(prior, pairs, seed=0)
-    timesteps = [timestep * prior.num_timesteps // 1000 for timestep in TIMESTEPS for _ in range(NOISES)]
-    with torch.no_grad():
-        errors = energy.mean(poses[:, None], timesteps, energy.noise(0, len(timesteps)))[:, 0]
-    strangeness = (errors / prior.usual_error).tolist()
+    strangeness = (denoising_errors(prior, pairs, poses) / prior.usual_error).tolist()
     return [
         Answer(latitude, longitude, math.nan, strangeness=times)
         for (latitude, longitude, _), times in zip(poses.tolist(), strangeness, strict=True)
     ]
+
+
+@torch.no_grad()
+def denoising_errors(prior: Prior, pairs: Pairs, poses: Tensor) -> Tensor:
+    """A prior's mean squared denoising errors `[B]` at relative poses `[B, 3]`, over all timesteps and both directions.
+
+    The mean over true poses of objects that the prior knows is its `usual_error`.
+    """
+    energy = PairEnergy(prior, pairs, seed=0)
+    timesteps = [timestep * prior.num_timesteps // 1000 for timestep in TIMESTEPS for _ in range(NOISES)]
+    return energy.mean(poses[:, None], timesteps, energy.noise(0, len(timesteps)))[:, 0]
 
 
 def in_words(latitude: float, longitude: float) -> str:

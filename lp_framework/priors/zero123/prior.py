@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lp_framework.errors import UserError
+from lp_framework.errors import UserError, positive
 from lp_framework.priors.base import Prior, ViewCode, resized
 from lp_framework.priors.ddim import ddim_sample, guided, scaled_linear_alphas, standard_normal
 from lp_framework.priors.zero123.cuda_graph import Replayed
@@ -260,9 +260,13 @@ class Zero123(Zero123Prior):
         cuda_graph: bool = False,
         attention: Attention = "sdpa",
         max_batch: int | None = None,
+        usual_error: float | None = None,
     ) -> None:
         networks = load_networks(self.PUBLISHED if path is None else path, revision, weights, dtype)
         super().__init__(networks, channels_last, compile, cuda_graph, attention, max_batch)
+        if usual_error is not None:
+            positive("prior", usual_error=usual_error)
+        self.usual_error = usual_error
 
 
 @register("prior", "zero123xl")
