@@ -26,7 +26,7 @@ class Pairs:
 
     `images` `[I, 3, H, W]` in [-1, 1] on white contains each image once; `reference` and `query` `[B]` are indices into
     it. `ids` `[B]` are integers that identify the pairs and key the random draws. `field_of_view` `[I]` is in radians,
-    on the CPU; None stands for that of the priors.
+    on the CPU; None means the priors' own.
     """
 
     images: Tensor
@@ -46,14 +46,14 @@ class Pairs:
 
 
 def pairs_of(batch: PairBatch, device: torch.device) -> Pairs:
-    """The pairs of a batch, on a device. The batch has images: nothing caches features."""
+    """Move the pairs of a batch to a device. The batch must contain images, not cached features."""
     batch = move_data_to_device(batch, device)
     return Pairs(batch.images, batch.reference, batch.query, batch.ids, batch.field_of_view)
 
 
 @dataclass(frozen=True)
 class ViewSets:
-    """S sets of V >= 2 images each, to be solved jointly.
+    """S sets of V >= 2 images each, solved jointly.
 
     `views` `[S, V]` are indices into `images`. `images`, `ids` `[S]` and `field_of_view` are as in `Pairs`.
     """
@@ -73,12 +73,12 @@ class ViewSets:
         return len(self.views)
 
     def with_first(self) -> Pairs:
-        """The S x (V - 1) pairs of each set's first image, as the reference, with its other images, set by set."""
+        """The S x (V - 1) pairs of each set's first image (the reference) with its other images, ordered by set."""
         views = self.views.shape[1]
         return self.pairs([0] * (views - 1), range(1, views))
 
     def pairs(self, reference: Sequence[int], query: Sequence[int]) -> Pairs:
-        """The S x P pairs of the positions `reference[P]` and `query[P]` within each set, set by set."""
+        """The S x P pairs of images at positions `reference[P]` and `query[P]` in each set, ordered by set."""
         places = torch.tensor([list(reference), list(query)])
         ids = keyed_bits(self.ids[:, None], *places, count=1).to(self.ids.device)
         chosen = self.views[:, places.to(self.views.device)]  # [S, 2, P]
@@ -93,7 +93,7 @@ def _check_images(images: Tensor) -> None:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of a batch: the number of samples that passed a network, and seconds."""
+    """The cost of a batch: number of samples passed through a network, and wall-clock seconds."""
 
     network_passes: int
     seconds: float = 0.0
@@ -101,16 +101,16 @@ class Cost:
 
 @dataclass(frozen=True)
 class Solution:
-    """What a solver found for B pairs from N starts each.
+    """The result of solving B pairs from N starts each.
 
     - `poses` `[B, N, 3]`: final relative poses.
     - `energies` `[B, N]`: lower is better; comparable along N.
     - `valid` `[B, N]`: whether the start succeeded.
     - `chosen` `[B]`: index of the start that is the answer.
-    - `cameras` `[B, N, 4, 4]`: only of solvers that predict full cameras; that of the query in the reference's frame,
-      with the translation up to a factor (see `geometry.two_view`).
-    - `trajectory` `[B, N, steps + 1, 3]`: on request; longitudes are not reduced.
-    - `probability` `[B, N]`: only of models with a density; that the true rotation is within 30 degrees of the pose's.
+    - `cameras` `[B, N, 4, 4]`: query cameras in the reference's frame, with translation up to scale (see
+      `geometry.two_view`); only from solvers that predict full cameras.
+    - `trajectory` `[B, N, steps + 1, 3]`: if requested; longitudes are not reduced to [0, 2 pi).
+    - `probability` `[B, N]`: that the true rotation is within 30 degrees of the pose's; only with a density model.
     """
 
     poses: Tensor
@@ -129,12 +129,12 @@ class Solution:
 
 @dataclass(frozen=True)
 class ViewSolution:
-    """What a solver found for S sets of V views.
+    """The result of solving S sets of V views.
 
     - `poses` `[S, V - 1, 3]`: poses of the other views relative to the first.
-    - `energies` `[S, V, V]`: of the ordered pairs (row: reference, column: query); NaN where they were not computed.
+    - `energies` `[S, V, V]`: of the ordered pairs (row: reference, column: query); NaN where not computed.
     - `valid` `[S]`: whether all poses of the set are valid.
-    - `pairs`: if each pair with the first view was solved independently, the solution of those S x (V - 1) pairs.
+    - `pairs`: solution of the S x (V - 1) pairs with the first view, if they were solved independently.
     """
 
     poses: Tensor
@@ -145,7 +145,7 @@ class ViewSolution:
 
 
 def choose(energies: Tensor) -> Tensor:
-    """Index `[B]` of the lowest energy of `[B, N]`; values that are not finite are ignored."""
+    """Index `[B]` of the lowest energy of `[B, N]`; non-finite values are ignored."""
     return energies.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf).argmin(dim=1)
 
 
@@ -163,7 +163,7 @@ def check_starts(problems: Pairs | ViewSets, starts: Tensor) -> None:
 
 
 def timed(solve: _Solve) -> _Solve:
-    """Decorator of `solve` and `solve_views`: checks the starts, needs no gradients, fills in the seconds."""
+    """Decorator for `solve` and `solve_views`: checks the starts, disables gradients, records the seconds."""
 
     @wraps(solve)
     @torch.no_grad()
@@ -177,7 +177,7 @@ def timed(solve: _Solve) -> _Solve:
 
 
 class NetworkUser:
-    """What is given networks (models, priors) or loads them, and keeps them as its attributes."""
+    """Base class of objects that hold networks (models, priors) as attributes."""
 
     def networks(self) -> list[nn.Module]:
         """The networks, to be moved to a device."""
@@ -187,31 +187,31 @@ class NetworkUser:
 class Solver(NetworkUser, ABC):
     """Estimates relative poses. A subclass's constructor declares what it needs by name: `model`, `prior`."""
 
-    one_answer = False  # it ignores starts and has one answer a pair: a success rate over starts is none
-    field_of_view_degrees: float | None = None  # of all images, where it was told one
+    one_answer = False  # it ignores starts and gives one answer per pair, so there is no success rate over starts
+    field_of_view_degrees: float | None = None  # of all images, if set
 
     def samples_per_pair(self, starts: int) -> int:
-        """Number of samples per pair that pass the prior at once: both directions of each start."""
+        """Number of samples per pair passed through the prior at once: both directions of each start."""
         return 2 * starts
 
     @abstractmethod
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """Solve all pairs from starts `[B, N, 3]`, in one batch.
 
-        The result of a start depends on its pair, the start and `seed` alone, not on the rest of the batch.
+        The result of a start depends only on its pair, the start and `seed`, not on the rest of the batch.
         """
 
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
         """Solve sets of V images from starts `[S, V - 1, N, 3]`: N for each other view, relative to the first.
 
-        By default each pair with the first view is solved independently; solvers that use all views override it.
+        By default each pair with the first view is solved independently; solvers that use all views override this.
         """
         check_starts(view_sets, starts)
         return of_first_views(view_sets, self.solve(view_sets.with_first(), starts.flatten(0, 1), seed))
 
 
 def of_first_views(view_sets: ViewSets, solution: Solution) -> ViewSolution:
-    """The solution of sets from that of their pairs with the first view."""
+    """Turn the solution of all pairs with the first view into the solution of the sets."""
     sets, views = view_sets.views.shape
     chosen = solution.chosen[:, None]
     energies = solution.energies.new_full((sets, views, views), torch.nan)

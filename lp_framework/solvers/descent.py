@@ -1,7 +1,7 @@
-"""Gradient descent from many starts at once, each with an optimizer and a schedule of its own.
+"""Gradient descent from many starts at once, each with its own optimizer state and learning rate schedule.
 
-All state is tensors on the poses' device, a row a start, and no step waits for a value from there: a batch is exactly
-its starts one by one.
+All state is kept in tensors on the poses' device, one row per start, and no step synchronizes with the device. Solving
+a batch gives exactly the results of solving its starts one by one.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from lp_framework.solvers.progress import steps_of
 
 
 class GradientDescent:
-    """Steps of `rate` `[B, N]` times the gradient, for parameters `[B, N, D]`."""
+    """Plain gradient descent with learning rates `rate` `[B, N]` for parameters `[B, N, D]`."""
 
     def __init__(self, parameters: Tensor, learning_rate: float) -> None:
         self.rate = parameters.new_full(parameters.shape[:-1], learning_rate)
 
     def step(self, gradient: Tensor) -> Tensor:
-        """What to add to the parameters, `[B, N, D]`."""
+        """The update to add to the parameters, `[B, N, D]`."""
         return -self.rate[..., None] * gradient
 
 
 class Adam(GradientDescent):
-    """Adam (Kingma and Ba 2015), with its usual constants."""
+    """Adam (Kingma and Ba 2015) with the usual constants."""
 
     BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
@@ -46,10 +46,10 @@ class Adam(GradientDescent):
 
 
 class Plateau:
-    """`torch.optim.lr_scheduler.ReduceLROnPlateau` (its defaults but for factor and patience) for each start.
+    """`torch.optim.lr_scheduler.ReduceLROnPlateau` for each start, with defaults except for `factor` and `patience`.
 
-    A rate is multiplied by `factor` once more than `patience` values in a row have not come below the least so far by
-    a ten-thousandth of it.
+    A rate is multiplied by `factor` after more than `patience` values in a row that do not improve on the minimum so
+    far by at least a relative 1e-4.
     """
 
     THRESHOLD = 1e-4
@@ -60,7 +60,7 @@ class Plateau:
         self.bad = torch.zeros_like(optimizer.rate, dtype=torch.int64)
 
     def step(self, values: Tensor) -> None:
-        """Takes note of the values `[B, N]` and changes the optimizer's rates."""
+        """Record the values `[B, N]` and update the optimizer's learning rates."""
         better = values < self.best * (1 - self.THRESHOLD)
         self.best = torch.where(better, values, self.best)
         self.bad = torch.where(better, 0, self.bad + 1)
@@ -69,11 +69,11 @@ class Plateau:
         self.bad = self.bad.masked_fill(late, 0)
 
 
-Energy = Callable[[Tensor, int], Tensor]  # of poses [B, N, P] at a step, [B, N]
+Energy = Callable[[Tensor, int], Tensor]  # (poses [B, N, P], step) -> energies [B, N]
 
 
 class Descended(NamedTuple):
-    """`trajectory` `[B, N, steps + 1, P]` from the starts to the ends; `total` `[B, N]`, the sum of the energies met;
+    """`trajectory` `[B, N, steps + 1, P]` from start to final pose; `total` `[B, N]`, the sum of the energies along it;
     `valid` `[B, N]`."""
 
     trajectory: Tensor
@@ -89,14 +89,14 @@ def descend(
     optimizer: GradientDescent,
     plateau: Plateau | None = None,
 ) -> Descended:
-    """Lower `energy(pose_of(parameters), step)` by so many steps from parameters `[B, N, D]`.
+    """Minimize `energy(pose_of(parameters), step)` for `steps` steps from parameters `[B, N, D]`.
 
-    The plateau is fed with the sum of the energies so far, as iFusion does. A start whose energy or gradient is not
-    finite stops at the last pose where they were, and is no longer valid.
+    The plateau schedule gets the sum of the energies so far, as in iFusion. A start whose energy or gradient becomes
+    non-finite stops at its last finite pose and is marked invalid.
     """
     valid = torch.ones_like(optimizer.rate, dtype=torch.bool)
     total = torch.zeros_like(optimizer.rate)
-    sound, place = parameters, pose_of(parameters)  # the last of each start where energy and gradient were finite
+    sound, place = parameters, pose_of(parameters)  # the last ones with a finite energy and gradient, per start
     trajectory = []
     for step in steps_of(steps, "descending the prior"):
         variable = parameters.detach().clone().requires_grad_()
@@ -119,7 +119,7 @@ def descend(
 
 
 def unwrapped(trajectory: Tensor) -> Tensor:
-    """The trajectory `[B, N, steps + 1, 3]` with longitudes that go on from step to step, by less than half a turn."""
+    """Unwrap the longitudes of a trajectory `[B, N, steps + 1, 3]`, so that each step is less than half a turn."""
     latitude, longitude, radius = trajectory.unbind(-1)
     turns = wrap_angle(longitude.diff(dim=-1)).cumsum(dim=-1)
     longitude = torch.cat([longitude[..., :1], longitude[..., :1] + turns], dim=-1)

@@ -1,4 +1,4 @@
-"""Local features, matched, and the essential matrix: what a user without a prior or a model would try first."""
+"""Local feature matching and the essential matrix: the classical baseline, without a prior or a model."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.feed_forward import RelativeCameraSolver, with_weights
 
 INSTALL = "pip install 'lp_framework[features]'"
-MINIMAL = 5  # matches that fix an essential matrix
+MINIMAL = 5  # matches that determine an essential matrix
 WEIGHTS = {  # hub ids of the learned matchers' published weights
     "lightglue": "ETH-CVG/lightglue_superpoint",
     "efficientloftr": "zju-community/efficientloftr",
 }
-SIDE = 640  # pixels of the images that learned matchers see; a multiple of 32, which EfficientLoFTR needs
-FINER = 64  # the processors round to whole pixels of the size that they are told; so to 1/64 of an image's
-WHITE = 0.98  # of [-1, 1]: what is darker in some channel is the object's
+SIDE = 640  # input size of the learned matchers in pixels; a multiple of 32, as EfficientLoFTR requires
+FINER = 64  # the processors round to whole pixels of the size passed to them; this makes it 1/64 of a pixel
+WHITE = 0.98  # in [-1, 1]: a pixel darker than this in any channel belongs to the object
 
 
 @register("solver", "features")
 class Features(RelativeCameraSolver):
-    """Matched local features and their essential matrix; one answer a pair, or none.
+    """Matched local features and their essential matrix; at most one answer per pair.
 
-    The essential matrix is that of PoseLib's LO-RANSAC (keyed by seed and pair), refined on its inliers, for square
-    images, each with its own field of view or all with `field_of_view_degrees`. With fewer than `fewest_inliers` of
-    them there is no answer. Where most matches have moved by no more than `tolerance_pixels`, both images are from the
-    same place. The energy is the share of matches that do not fit.
+    PoseLib's LO-RANSAC (keyed by seed and pair) estimates the essential matrix and refines it on the inliers. Images
+    must be square; each has its own field of view, or all have `field_of_view_degrees`. There is no answer with fewer
+    than `fewest_inliers` inliers. If most matches move by at most `tolerance_pixels`, both cameras are taken to be at
+    the same place. The energy is the share of outliers among the matches.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Features(RelativeCameraSolver):
             raise UserError(f"solver.matcher=sift has no weights, got solver.weights={weights}")
         self.poselib = optional_import("poselib", "solver=features", INSTALL)
         self.matcher = Sift(ratio) if matcher == "sift" else Learned(matcher, weights)
-        self.network = self.matcher.network  # where those look who move it to a device
+        self.network = self.matcher.network  # an attribute, so that it is moved to the device
         self.tolerance, self.fewest_inliers = tolerance_pixels, fewest_inliers
         self.field_of_view_degrees = field_of_view_degrees
 
@@ -87,7 +87,7 @@ class Features(RelativeCameraSolver):
         return flip @ from_opencv(cameras), energies, 0 if self.network is None else len(pairs)
 
     def focal_lengths(self, pairs: Pairs) -> list[float]:
-        """The focal length of every image, in pixels."""
+        """Focal length of each image in pixels."""
         angles = pairs.field_of_view
         if angles is None or self.field_of_view_degrees is not None:
             degrees = self.field_of_view_degrees or FIELD_OF_VIEW_DEGREES
@@ -98,14 +98,14 @@ class Features(RelativeCameraSolver):
     def relative_camera(
         self, matches: Matches, width: int, focal: tuple[float, float], seed: int
     ) -> tuple[NDArray[np.float64], float] | None:
-        """The query's camera in the reference's frame, `[4, 4]` with OpenCV's axes and a translation of length 1 (0
-        where it has not moved), and the share of matches that do not fit it; None where there are too few. The `focal`
-        lengths are those of the reference and the query, in pixels."""
+        """The query's camera in the reference's frame, `[4, 4]` with OpenCV axes and a translation of length 1 (0 if
+        the camera did not move), and the share of outliers; None if there are too few matches or inliers. `focal`
+        holds the focal lengths of reference and query in pixels."""
         count = len(matches.reference)
         if count < self.fewest_inliers:
             return None
         centre = (width - 1) / 2  # (0, 0) is the centre of the first pixel
-        seen = centre + (matches.query - centre) * (focal[0] / focal[1])  # with the reference's focal length
+        seen = centre + (matches.query - centre) * (focal[0] / focal[1])  # at the reference's focal length
         moved = np.linalg.norm(seen - matches.reference, axis=1)
         if np.median(moved) <= self.tolerance:
             return np.eye(4), float((moved > self.tolerance).mean())
@@ -123,22 +123,22 @@ class Features(RelativeCameraSolver):
 
 
 class Matches(NamedTuple):
-    """M points in the reference and the query image that show the same place, `[M, 2]` each: x to the right and y down
-    in pixels, (0, 0) the centre of the first one."""
+    """M corresponding points in the reference and the query image, `[M, 2]` each: x to the right and y down in pixels,
+    with (0, 0) at the centre of the first pixel."""
 
     reference: NDArray[np.float64]
     query: NDArray[np.float64]
 
 
 class Sift:
-    """SIFT of OpenCV (Lowe 2004) within the object, matched where nearest both ways, at `ratio` times the distance of
-    the second nearest or less."""
+    """OpenCV's SIFT (Lowe 2004) on the object, with mutual nearest neighbours as matches that pass the ratio test:
+    distance at most `ratio` times that of the second nearest."""
 
     network = None
 
     def __init__(self, ratio: float) -> None:
         self.cv2, self.ratio = optional_import("cv2", "solver=features", INSTALL), ratio
-        self.sift = self.cv2.SIFT_create(enable_precise_upscale=True)  # else points are off by a quarter of a pixel
+        self.sift = self.cv2.SIFT_create(enable_precise_upscale=True)  # otherwise points are off by 1/4 pixel
         self.nearest = self.cv2.BFMatcher(self.cv2.NORM_L2)
 
     def describe(self, image: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
@@ -149,14 +149,14 @@ class Sift:
         return places, np.zeros((0, 128), np.float32) if descriptors is None else descriptors
 
     def match(self, reference: Any, query: Any) -> Matches:
-        """Matches of two described images."""
+        """Match two described images."""
         forth, back = self._pairs(reference[1], query[1]), self._pairs(query[1], reference[1])
         mutual = [(first, second) for first, second in forth.items() if back.get(second) == first]
         first, second = np.array(mutual, dtype=int).reshape(-1, 2).T
         return Matches(reference[0][first], query[0][second])
 
     def _pairs(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> dict[int, int]:
-        """For those of our descriptors that pass the ratio test, the nearest of theirs."""
+        """Map each of our descriptors that passes the ratio test to its nearest neighbour among theirs."""
         if len(theirs) < 2:
             return {}
         two = self.nearest.knnMatch(ours, theirs, k=2)
@@ -164,7 +164,7 @@ class Sift:
 
 
 class Learned:
-    """A network of transformers that matches key points: LightGlue on SuperPoint (2023) or EfficientLoFTR (2024)."""
+    """A keypoint matcher from `transformers`: LightGlue on SuperPoint (2023) or EfficientLoFTR (2024)."""
 
     network: nn.Module
 
@@ -179,21 +179,21 @@ class Learned:
         self.network.eval().requires_grad_(False)
 
     def describe(self, image: Tensor) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Pixels `[H, W, 3]` and where the object is, `[H, W]`, of an image `[3, H, W]` in [-1, 1] on white."""
+        """Pixels `[H, W, 3]` and object mask `[H, W]` of an image `[3, H, W]` in [-1, 1] on white."""
         return pixels(image), foreground(image)
 
     @torch.no_grad()
     def match(self, reference: Any, query: Any) -> Matches:
-        """Matches on the objects of two described images."""
+        """Match two described images, on the object only."""
         images = [reference[0], query[0]]
         inputs = self.processor([images], size={"height": SIDE, "width": SIDE}, return_tensors="pt")
         outputs = self.network(**inputs.to(next(self.network.parameters()).device))
         sizes = [[tuple(FINER * side for side in image.shape[:2]) for image in images]]
-        # Its threshold of scores is the least that EfficientLoFTR's own settings keep.
+        # The threshold is the lowest score that EfficientLoFTR's own settings keep.
         (found,) = self.processor.post_process_keypoint_matching(outputs, sizes, threshold=0.2)
         ends, on_object = [], np.ones(len(found["keypoints0"]), dtype=bool)
         for key, (image, mask) in (("keypoints0", reference), ("keypoints1", query)):
-            size = np.array(image.shape[1::-1])  # pixels of SIDE are counted from the centre of their first, too
+            size = np.array(image.shape[1::-1])  # at SIDE, too, (0, 0) is the centre of the first pixel
             points = found[key].cpu().double().numpy() / FINER + size / (2 * SIDE) - 0.5
             column, row = np.rint(points).astype(int).clip(0, size - 1).T
             on_object &= mask[row, column]
@@ -202,7 +202,7 @@ class Learned:
 
 
 def foreground(image: Tensor) -> NDArray[np.bool_]:
-    """Where the object is, `[H, W]`, in an image `[3, H, W]` on white: what is not white, and white within it."""
+    """Object mask `[H, W]` of an image `[3, H, W]` on white: all non-white pixels, with holes filled."""
     return np.asarray(binary_fill_holes((image.amin(dim=0) < WHITE).cpu().numpy()))
 
 

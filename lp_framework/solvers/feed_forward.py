@@ -1,4 +1,4 @@
-"""Solvers that see a pair and predict its relative camera, without descent: the networks DUSt3R and VGGT."""
+"""Feed-forward solvers, which predict the relative camera of a pair directly: DUSt3R and VGGT."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Loaded = TypeVar("Loaded")
 
 
 class RelativeCameraSolver(Solver):
-    """One answer a pair (N = 1), **starts are ignored**; a pair without an answer is invalid and its pose NaN.
+    """One answer per pair (N = 1), **starts are ignored**; a pair without an answer is invalid and its pose is NaN.
 
-    The `Solution` has full cameras, whose translations are known up to a factor. Its poses are theirs as
-    `pose_of_relative_camera` has them, with the reference `reference_radius` (object sizes) from the object's centre;
-    1.4 is where `estimate` puts that of prepared photographs.
+    The `Solution` has full cameras, with translations up to scale. `pose_of_relative_camera` converts them to poses,
+    with the reference at `reference_radius` (object sizes) from the object's centre; 1.4 is the distance that
+    `estimate` assumes for prepared photographs.
     """
 
     one_answer = True
@@ -37,7 +37,7 @@ class RelativeCameraSolver(Solver):
 
     @abstractmethod
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
-        """Relative cameras `[B, 4, 4]` (float64; NaN: none), energies `[B]`, and passes through the network."""
+        """Relative cameras `[B, 4, 4]` (float64; NaN: no answer), energies `[B]`, and number of network passes."""
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
@@ -54,12 +54,12 @@ class RelativeCameraSolver(Solver):
 
 
 def with_weights(load: Callable[[str], Loaded], network: str, weights: str) -> Loaded:
-    """What `load` makes of the weights of a network (a file, a folder or a hub id); `UserError` where it cannot."""
+    """Load the weights of a network (a file, a folder or a hub id); raises `UserError` if `load` fails."""
     if Path(weights).suffix in (".pt", ".pth", ".safetensors") and not Path(weights).is_file():
         raise UserError(f"{weights}: there is no such file with the weights of {network}")
     try:
         return load(weights)
-    except Exception as error:  # the hub's package and its HTTP libraries have many of their own
+    except Exception as error:  # the hub's package and its HTTP libraries raise many types
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(
             f"{weights}: the weights of {network} cannot be loaded from there ({reason}); "
@@ -68,7 +68,7 @@ def with_weights(load: Callable[[str], Loaded], network: str, weights: str) -> L
 
 
 class FeedForward(RelativeCameraSolver):
-    """A network that sees a pair, the reference first, and predicts both cameras, in any frame and at any scale.
+    """A network that predicts both cameras of a pair, reference first, in any frame and at any scale.
 
     The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`.
     """
@@ -84,15 +84,15 @@ class FeedForward(RelativeCameraSolver):
 
     @abstractmethod
     def cameras(self, images: Tensor) -> Tensor:
-        """Cameras to world `[2, 4, 4]` with OpenCV's axes of prepared images `[2, 3, H, W]` in [-1, 1]; NaN: none."""
+        """Camera-to-world matrices `[2, 4, 4]` (OpenCV axes; NaN: no answer) of prepared images `[2, 3, H, W]`."""
 
     def prepare(self, images: Tensor) -> Tensor:
-        """Images `[I, 3, H, W]` at the network's size: resampled as Pillow does, in [-1, 1]."""
+        """Resize images `[I, 3, H, W]` in [-1, 1] to the network's size, with Pillow's resampling."""
         size = (self.image_size, self.image_size)
         return interpolate(images, size, mode="bicubic", align_corners=False, antialias=True).clamp(-1, 1)
 
     def predict(self, pairs: Pairs, seed: int) -> tuple[Tensor, Tensor, int]:
-        """See `RelativeCameraSolver.predict`; these have no energies, all are 0."""
+        """See `RelativeCameraSolver.predict`; there is no energy, so all are 0."""
         ends = torch.stack([pairs.reference, pairs.query], dim=1)
         both = torch.stack([self.cameras(self.prepare(pairs.images[pair])).cpu().double() for pair in ends])
         reference, query = from_opencv(both).unbind(dim=1)
@@ -102,9 +102,9 @@ class FeedForward(RelativeCameraSolver):
 
 @register("solver", "dust3r")
 class Dust3r(FeedForward):
-    """DUSt3R (Wang et al. 2024): point maps of both images, and the cameras that fit them; one answer a pair.
+    """DUSt3R (Wang et al. 2024): point maps of both images and the cameras fitted to them; one answer per pair.
 
-    Both orders of the images go through the network; the cameras are those of the authors' `PairViewer`.
+    The network sees the images in both orders; the cameras are computed as in the authors' `PairViewer`.
     """
 
     patch, passes_per_pair = 16, 2
@@ -119,7 +119,7 @@ class Dust3r(FeedForward):
         model, self.inference, self.alignment = (
             optional_import(f"dust3r.{part}", "solver=dust3r", where) for part in ("model", "inference", "cloud_opt")
         )
-        torch.serialization.add_safe_globals([argparse.Namespace])  # in its checkpoint files, beside the weights
+        torch.serialization.add_safe_globals([argparse.Namespace])  # stored in its checkpoints beside the weights
         network = with_weights(model.AsymmetricCroCo3DStereo.from_pretrained, "DUSt3R", weights)
         super().__init__(network, image_size, reference_radius)
 
@@ -132,13 +132,13 @@ class Dust3r(FeedForward):
         output = self.inference.inference([(first, second), (second, first)], self.network, images.device, batch_size=2)
         mode = self.alignment.GlobalAlignerMode.PairViewer
         found: Tensor = self.alignment.global_aligner(output, device="cpu", mode=mode, verbose=False).get_im_poses()
-        # Where it finds no camera for the other image's points it puts both at the same place, to the last bit.
+        # If it finds no camera for the other image's points, it places both at exactly the same position.
         return torch.full_like(found, torch.nan) if torch.equal(found[0], found[1]) else found
 
 
 @register("solver", "vggt")
 class VGGT(FeedForward):
-    """VGGT (Wang et al. 2025): both cameras from its camera head; one answer a pair."""
+    """VGGT (Wang et al. 2025): both cameras from its camera head; one answer per pair."""
 
     patch, passes_per_pair = 14, 1
 
@@ -164,7 +164,7 @@ class VGGT(FeedForward):
         batch = (images[None] + 1) / 2
         with torch.autocast(images.device.type, dtype=torch.bfloat16, enabled=images.is_cuda):  # as published
             tokens, _ = network.aggregator(batch)
-        encoded = network.camera_head(tokens)[-1]  # of the last refinement
+        encoded = network.camera_head(tokens)[-1]  # after the last refinement
         world_to_camera, _ = self.encoding.pose_encoding_to_extri_intri(encoded, batch.shape[-2:])
         matrices = world_to_camera[0].cpu().double()  # [2, 3, 4]
         return inverse(rigid_transform(matrices[..., :3], matrices[..., 3]))

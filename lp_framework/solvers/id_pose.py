@@ -1,4 +1,4 @@
-"""ID-Pose (Cheng et al. 2023): candidates are probed, the best descend a little, the very best far.
+"""ID-Pose (Cheng et al. 2023): probe a grid of candidates, explore from the better half, refine the best.
 
 Published code: `estimate_poses` and `find_optimal_poses` of github.com/xt4d/id-pose.
 """
@@ -24,22 +24,22 @@ from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, V
 from lp_framework.solvers.descent import GradientDescent, descend
 from lp_framework.solvers.pair_energy import PairEnergy, keyed_noise
 
-_REFINEMENT = 0x4944  # separates the draws of the refinement from those of the exploration under the same seed
+_REFINEMENT = 0x4944  # gives refinement and exploration independent draws under the same seed
 
 
 @register("solver", "id_pose")
 @dataclass(eq=False)
 class IDPose(Solver):
-    """ID-Pose: probes a grid of candidates, then plain gradient descent on the spherical pose, one direction a step.
+    """ID-Pose: probe a grid of candidates, then plain gradient descent on the spherical pose, one direction per step.
 
     Defaults are the published settings. Unless `candidates=starts`, **starts are ignored**. All candidates are probed
-    in both directions with `probes` fixed noises; the better half descends by `exploration_steps`, is probed again, and
-    the `kept` best stay. The chosen ones descend by `refinement_steps` for each unknown image, with fresh noise, at
-    `timestep` (a share of the prior's range); the answer is the mean of an image's last `averaged` poses.
+    in both directions with `probes` fixed noises. The better half takes `exploration_steps` descent steps and is probed
+    again; the `kept` best remain. The chosen ones take `refinement_steps` steps per unknown image with fresh noise at
+    `timestep` (a fraction of the prior's range); the answer is the mean of an image's last `averaged` poses.
 
-    A `Solution` has the kept candidates as its N: the chosen one refined, the others as explored; the energies are
-    those before refinement. The published code reads the raw weights of a checkpoint (`prior.weights=raw`), and its
-    rates are for Zero123's energy: plain gradient descent diverges where rate times curvature passes 2.
+    The N answers of a `Solution` are the kept candidates: the chosen one is refined, the others are as explored, and
+    energies are those before refinement. The published code reads a checkpoint's raw weights (`prior.weights=raw`). Its
+    rates are tuned for Zero123's energy: plain gradient descent diverges where rate times curvature exceeds 2.
     """
 
     prior: Prior
@@ -74,7 +74,7 @@ class IDPose(Solver):
         self.probe_timesteps = [int(share * self.prior.num_timesteps) for share in shares]
 
     def samples_per_pair(self, starts: int) -> int:
-        """See `Solver`; between the many candidates of the exploration and the one of the refinement."""
+        """See `Solver`; a compromise between the many candidates explored and the one refined."""
         return 2 * self.kept
 
     @timed
@@ -100,7 +100,7 @@ class IDPose(Solver):
     @torch.inference_mode(False)
     @torch.no_grad()
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
-        """See `Solver.solve_views`: chosen and refined together; the energies are those of the chosen candidates."""
+        """See `Solver.solve_views`: joint choice and refinement; energies are those of the chosen candidates."""
         sets, views = view_sets.views.shape
         energy = PairEnergy(self.prior, view_sets.with_first(), seed)
         explored, alone = self.explore(energy, starts.flatten(0, 1))
@@ -116,12 +116,12 @@ class IDPose(Solver):
         for number, (i, j) in enumerate(duos):
             energies[:, i + 1, j + 1] = between[row, number, chosen[:, i], chosen[:, j]]
         valid = valid & energies[:, 0, 1:].isfinite().all(dim=1)
-        energies = torch.where(energies.isnan(), energies.mT, energies)  # both directions are in each
+        energies = torch.where(energies.isnan(), energies.mT, energies)  # each averages both directions
         return ViewSolution(reduce_longitude(refined), energies, valid, Cost(energy.passes))
 
     def explore(self, energy: PairEnergy, starts: Tensor) -> tuple[Tensor, Tensor]:
-        """The trajectories `[B, K, steps, 3]` of the K best candidates, best first, and their probed energies `[B, K]`
-        (NaN where the prior failed): the better half of all is led a little downhill and probed again."""
+        """Probe all candidates, descend from the better half for a few steps, and probe again: the trajectories
+        `[B, K, steps, 3]` of the K best, best first, and their probed energies `[B, K]` (NaN if the prior failed)."""
         given = self.candidates == "starts"
         poses = starts.clone() if given else starts.new_tensor(self.grid).repeat(len(starts), 1, 1)
         noise = energy.noise(self.exploration_steps, len(self.probe_timesteps))
@@ -136,7 +136,7 @@ class IDPose(Solver):
 
         steps, rate = self.exploration_steps, GradientDescent(poses, self.exploration_rate)
         trajectory, _, valid = descend(one_direction, lambda poses: poses, poses, steps, rate)
-        trajectory = trajectory[:, :, : max(1, steps)]  # as published, what counts is the last pose before an update
+        trajectory = trajectory[:, :, : max(1, steps)]  # as published, the last pose before an update counts
         probed = energy.mean(trajectory[:, :, -1], self.probe_timesteps, noise).masked_fill(~valid, torch.nan)
         best = _order(probed)[:, : self.kept]
         return trajectory.take_along_dim(best[..., None, None], dim=1), probed.gather(1, best)
@@ -144,8 +144,8 @@ class IDPose(Solver):
     def energies_between(
         self, energy: PairEnergy, view_sets: ViewSets, poses: Tensor, duos: Sequence[tuple[int, int]]
     ) -> Tensor:
-        """Probed energies `[S, P, K, K]` of the relative poses that candidates `[S, V - 1, K, 3]` imply for P duos of
-        the other images, numbered from 0."""
+        """Probed energies `[S, P, K, K]` of the relative poses implied by candidates `[S, V - 1, K, 3]` for P unordered
+        pairs (`duos`) of the images after the first, numbered from 0."""
         sets, _, count, _ = poses.shape
         if not duos:
             return poses.new_empty(sets, 0, count, count)
@@ -159,15 +159,15 @@ class IDPose(Solver):
         return energies.view(sets, len(duos), count, count)
 
     def refine(self, energy: PairEnergy, views: Tensor, ids: Tensor, selected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Gradient descent of the other poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair a step: the
-        answers `[S, V - 1, 3]`, whether they are sound `[S]`, and the trajectories `[S, steps + 1, V - 1, 3]`."""
+        """Gradient descent on the poses `[S, V - 1, 3]` of sets of images `[S, V]`, one ordered pair per step: answers
+        `[S, V - 1, 3]`, whether they are valid `[S]`, and trajectories `[S, steps + 1, V - 1, 3]`."""
         others, keys = selected.shape[1], on_cpu(ids)
         cycle = [pair for duo in combinations(range(others + 1), 2) for pair in (duo, duo[::-1])]  # (source, target)
         moved = self._moved(cycle, keys, energy.seed, others).to(ids.device)  # [steps, S, V]
 
         def one_pair(flat: Tensor, step: int) -> Tensor:
             source, target = cycle[step % len(cycle)]
-            poses = pad(flat.unflatten(2, (others, 3)), (0, 0, 1, 0))[:, 0]  # [S, V, 3], the first image's is 0
+            poses = pad(flat.unflatten(2, (others, 3)), (0, 0, 1, 0))[:, 0]  # [S, V, 3], 0 for the first image
             poses = torch.where(moved[step][..., None], poses, poses.detach())
             noise = keyed_noise(self.prior, ids.device, energy.seed, _REFINEMENT, keys, step)
             relative = (poses[:, target] - poses[:, source])[:, None]
@@ -177,7 +177,7 @@ class IDPose(Solver):
         rate = GradientDescent(flat, self.refinement_rate)
         trajectory, _, valid = descend(one_pair, lambda poses: poses, flat, len(moved), rate)
         trajectory = trajectory[:, 0].unflatten(2, (others, 3))  # [S, steps + 1, V - 1, 3]
-        # As published, a pose is recorded when the step after its update begins: the last step's never is.
+        # As published, a pose is recorded at the start of the step after its update, so the last step's never is.
         recorded = moved[:-1, :, 1:].transpose(0, 1)  # [S, steps - 1, V - 1]
         late = recorded & (recorded.flip(1).cumsum(1).flip(1) <= self.averaged)
         count = late.sum(dim=1)[..., None]
@@ -185,7 +185,7 @@ class IDPose(Solver):
         return torch.where(count > 0, mean, selected), valid[:, 0], trajectory
 
     def _moved(self, cycle: Sequence[tuple[int, int]], ids: Tensor, seed: int, others: int) -> Tensor:
-        """Which image of its pair a step moves, `[steps, S, V]`: not the first; of two others a random one."""
+        """The image that each step moves, `[steps, S, V]`: never the first; random if neither is the first."""
         number = torch.arange(others * self.refinement_steps)[:, None]
         source, target = torch.tensor(cycle)[number % len(cycle)].unbind(-1)  # [steps, 1]
         coin = keyed_uniform(seed, _REFINEMENT, ids, number, count=1)[..., 0] < 0.5
@@ -194,7 +194,7 @@ class IDPose(Solver):
         return one_hot(moved, others + 1).bool()
 
     def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
-        """Denoising errors `[B, N]` of images `target` from `source`, `[B]`, under poses `[B, N, 3]`, a noise a row."""
+        """Denoising errors `[B, N]` of images `target` from `source`, `[B]`, at poses `[B, N, 3]`, a noise per row."""
         count, timestep = poses.shape[1], int(self.timestep * self.prior.num_timesteps)
         energy.passes += poses.shape[0] * count
         errors = self.prior.denoising_error(
@@ -208,11 +208,11 @@ class IDPose(Solver):
 
 
 def triangular_choice(alone: Tensor, between: Tensor, duos: Sequence[tuple[int, int]]) -> Tensor:
-    """ID-Pose's selection among candidates for all other images of a set together: index `[S, V - 1]` of K each.
+    """ID-Pose's joint selection of one of K candidates for each image after the first: indices `[S, V - 1]`.
 
     `alone` `[S, V - 1, K]` are the candidates' energies with the first image, `between` `[S, P, K, K]` those within
-    the P `duos`. A candidate collects from every duo of its image the least sum of both own energies and the one
-    between, but at most three times its own, lest an image without a good candidate count against it.
+    the P `duos`. For every duo of its image, a candidate adds the minimum over partners of the sum of both `alone`
+    energies and the one between, capped at three times its own so that an image without a good candidate does no harm.
     """
     alone, between = (each.nan_to_num(nan=torch.inf) for each in (alone, between))
     if not duos:
@@ -226,5 +226,5 @@ def triangular_choice(alone: Tensor, between: Tensor, duos: Sequence[tuple[int, 
 
 
 def _order(energies: Tensor) -> Tensor:
-    """Indices `[B, N]` from the least energy `[B, N]` to the largest; what is not finite comes last."""
+    """Indices `[B, N]` that sort the energies `[B, N]` in ascending order, NaN last."""
     return energies.nan_to_num(nan=torch.inf).argsort(dim=1, stable=True)

@@ -1,10 +1,10 @@
-"""What all pairs of several views tell together of where the views are: the paper's joint reasoning on densities.
+"""The paper's joint reasoning over several views, applied to the densities of all pairs.
 
-A pair's density has several modes, and which one is right, the pair often cannot tell. All pairs can: longitudes of the
-views that are right agree with every pair. So hypotheses of all longitudes are drawn along trees of pairs, each climbs
-to the nearest maximum of the sum of all pairs' log-densities, and a view's density is the mixture over the maxima of
-what the other views, there, tell of it. Pairs that share views err alike: together they count for more than one pair,
-and for less than as many independent ones.
+A pair's density has several modes, and the pair alone often cannot tell which is right. All pairs together can: the
+true longitudes agree with every pair. Hypotheses for all longitudes are sampled along random trees of pairs, and each
+climbs to a local maximum of the sum of all pairs' log-densities. A view's density is the mixture, over these maxima, of
+its density given the other views. Pairs that share views have correlated errors, so together they count for more than
+one pair but for less than as many independent ones.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from lp_framework.keyed_random import keyed_uniform
 from lp_framework.models.pose_density import GRID, PoseDensity
 
 HYPOTHESES = 64
-SWEEPS = 10  # of all views, each moved to its best longitude given the others
-DEPENDENCE = 0.7  # at 0 V - 1 pairs would be independent, at 1 they would tell no more than one
-_TREES = 0x4A4F  # separates these draws from others under the same seed
+SWEEPS = 10  # coordinate ascent over all views: each moves to its best longitude given the others
+DEPENDENCE = 0.7  # at 1 all V - 1 pairs together count as one; at 0 they count as independent
+_TREES = 0x4A4F  # makes these draws independent of others under the same seed
 
 
 def joint_density(density: PoseDensity, sets: int, ids: Tensor, seed: int) -> PoseDensity:
     """The densities of S x (V - 1) views relative to the first, from those of all ordered pairs `[S x V x (V - 1)]`
-    (by reference, then query); `ids` `[S]` of the sets, by which `seed` draws."""
+    (by reference, then query). Draws are keyed by `seed` and the sets' `ids` `[S]`."""
     views = round((1 + math.sqrt(1 + 4 * len(density.logits) / sets)) / 2)
     told = _table(density.logits.log_softmax(dim=-1), sets, views)
-    told = (told + told.transpose(1, 2).flip(-1).roll(1, -1)) / 2  # with the other order's, of negative longitudes
+    told = (told + told.transpose(1, 2).flip(-1).roll(1, -1)) / 2  # average with the reversed pair, longitude negated
     places = _climbed(told, _drawn(told, ids, seed))
     mean, deviation = _agreed(
         _table(density.mean, sets, views), _table(density.deviation.square().reciprocal(), sets, views)
@@ -45,7 +45,7 @@ def _table(values: Tensor, sets: int, views: int) -> Tensor:
 
 
 def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:
-    """Longitudes `[S, H, V]` (numbers of the grid) along random trees of pairs, sure pairs sooner, by their density."""
+    """Sample longitudes `[S, H, V]` (grid indices) along random trees of pairs, preferring peaked densities."""
     sets, views = told.shape[:2]
     uniform = keyed_uniform(
         seed, _TREES, ids[:, None, None], torch.arange(HYPOTHESES)[:, None], torch.arange(views - 1), count=2
@@ -70,14 +70,14 @@ def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:
 
 
 def _given_others(told: Tensor, places: Tensor, view: int) -> Tensor:
-    """Sums over the other views of what their pairs tell of `view`, `[S, H, GRID]`."""
+    """Log-densities of `view` given the other views, summed over their pairs, `[S, H, GRID]`."""
     turn = (torch.arange(GRID, device=told.device) - places[..., None]) % GRID  # [S, H, V, GRID]
     of_view = told[:, None, :, view].expand(-1, places.shape[1], -1, -1)
     return of_view.gather(-1, turn).sum(dim=2) - of_view[:, :, view].gather(-1, turn[:, :, view])
 
 
 def _climbed(told: Tensor, places: Tensor) -> Tensor:
-    """Every hypothesis at a maximum: no view alone can be moved to a better longitude, or `SWEEPS` are over."""
+    """Move each hypothesis to a local maximum by coordinate ascent over the views, for at most `SWEEPS` sweeps."""
     for _ in range(SWEEPS):
         before = places.clone()
         for view in range(1, told.shape[1]):
@@ -88,13 +88,13 @@ def _climbed(told: Tensor, places: Tensor) -> Tensor:
 
 
 def _mixture(told: Tensor, places: Tensor) -> Tensor:
-    """Log-densities `[S, V - 1, GRID]` of the views but the first."""
+    """Log-densities `[S, V - 1, GRID]` of all views except the first."""
     _, hypotheses, views = places.shape
     turn = (places[:, :, None] - places[..., None]) % GRID  # [S, H, V, V]
     at = told[:, None].expand(-1, hypotheses, -1, -1, -1).gather(-1, turn[..., None])[..., 0]
     witnesses = (views - 1) ** DEPENDENCE
     score = at.sum(dim=(2, 3)) / 2 / witnesses  # the diagonal is 0
-    same = (places[:, :, None] == places[:, None]).all(dim=-1).tril(-1).any(dim=-1)  # as an earlier one
+    same = (places[:, :, None] == places[:, None]).all(dim=-1).tril(-1).any(dim=-1)  # duplicates of an earlier one
     share = score.masked_fill(same, -torch.inf).log_softmax(dim=-1)[..., None]
     others = [
         (share + (_given_others(told, places, view) / witnesses).log_softmax(dim=-1)).logsumexp(dim=1)
@@ -104,8 +104,8 @@ def _mixture(told: Tensor, places: Tensor) -> Tensor:
 
 
 def _agreed(mean: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
-    """Least squares of latitude and radius: values and deviations `[S, V - 1, 2]` relative to the first view, from the
-    differences `[S, V, V, 2]` of ordered pairs; deviations as of one witness, see above."""
+    """Least-squares latitude and radius relative to the first view: values and deviations `[S, V - 1, 2]`, from the
+    differences `[S, V, V, 2]` of ordered pairs; deviations as from a single pair, see above."""
     views = mean.shape[1]
     weight = (precision + precision.transpose(1, 2)).movedim(-1, 1)  # [S, 2, V, V]
     weight = weight * ~torch.eye(views, dtype=torch.bool, device=mean.device)

@@ -29,20 +29,20 @@ from lp_framework.solvers.base import (
 from lp_framework.solvers.joint_density import joint_density
 from lp_framework.solvers.progress import steps_of
 
-SHARP = 0.15  # radians, scene units: smoothing at which the modes of a density stay apart
+SHARP = 0.15  # radians, scene units: smoothing small enough to keep the modes of a density apart
 
 
 @register("solver", "langevin")
 class Langevin(Solver):
     """First stage alone: x <- x + alpha s(x) + gamma z on a score or energy model, for all starts of all pairs.
 
-    `choose_by` says by what the answer is chosen among the ends: `distance`, the least distance to the truth that the
-    field itself tells, so that under noise it is the end that happens to be nearest; `agreement`, the least median
-    distance to the other ends; `energy`, that of an energy model; by default what the model says.
+    `choose_by` selects the answer among the final poses: `distance`, the lowest distance to the truth as estimated from
+    the field, which under noise picks the pose that happens to be nearest; `agreement`, the lowest median distance to
+    the other final poses; `energy`, the lowest energy of an energy model; by default the model's own choice.
 
-    `sigma` is for models whose field is known at every sigma (`matching`): one, or the first and the last step's,
-    between which it falls geometrically. Steps are alpha sigma^2 / (the model's sigma)^2 long then, so that each leaves
-    the same share of the way to an only truth, and the noise goes with sigma.
+    `sigma` is for models that know their field at every sigma (`matching`): one value, or those of the first and the
+    last step with geometric interpolation in between. The step size is then alpha sigma^2 / (the model's sigma)^2, so
+    that each step covers the same fraction of the way to a single truth, and the noise is proportional to sigma.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Langevin(Solver):
         sigma: float | Sequence[float] | None = None,
         trajectory: bool = False,
     ) -> None:
-        limit = 2 * model.sigma**2  # a step leaves 1 - alpha / sigma^2 of the way to the truth
+        limit = 2 * model.sigma**2  # a step leaves a fraction 1 - alpha / sigma^2 of the way to go
         converging = f"between 0 and {limit:g}, twice the model's sigma^2, to converge"
         check_settings("solver", ("alpha", alpha, 0 < alpha < limit, converging))
         at_least(0, "solver", iterations=iterations)
@@ -68,14 +68,14 @@ class Langevin(Solver):
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve`. A start is invalid when its pose is not finite."""
+        """See `Solver.solve`. A start is invalid if its final pose is not finite."""
         codes = self.model.encode(pairs.images)
         condition = self.model.condition(codes[pairs.reference], codes[pairs.query])
         return self._descend(condition, pairs, starts, seed)
 
     @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
-        """See `Solver.solve_views`. Of a model with densities, those of all ordered pairs are combined."""
+        """See `Solver.solve_views`. If the model has densities, those of all ordered pairs are combined."""
         if not self.model.has_density:
             return super().solve_views(view_sets, starts, seed)
         codes = self.model.encode(view_sets.images)
@@ -106,7 +106,7 @@ class Langevin(Solver):
         return Solution(reduce_longitude(pose), energies, valid, chosen, cost, trajectory=path, probability=within)
 
     def _noise(self, pairs: Pairs, starts: Tensor, seed: int) -> Tensor:
-        """The noise gamma z_t of every start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""
+        """The noise gamma z_t of each start and step, `[B, N, iterations, 3]`, keyed by seed, pair and start."""
         count, shape = starts.shape[1], (*starts.shape[:2], self.iterations, 3)
         if not any(self.gamma):
             return starts.new_zeros(shape)
@@ -114,23 +114,23 @@ class Langevin(Solver):
         return (draws.view(shape) * torch.tensor(self.gamma, dtype=draws.dtype)).to(starts)
 
     def _energies(self, condition: Tensor, ends: Tensor) -> Tensor:
-        """By what the answer is chosen, `[B, N]`: see the class."""
+        """The values `[B, N]` whose minimum is the answer; see `choose_by`."""
         if self.choose_by == "distance":
             return self._distance(condition, ends)
         if self.choose_by == "agreement":
             offset = ends[:, :, None] - ends[:, None]
             offset = torch.stack([offset[..., 0], wrap_angle(offset[..., 1]), offset[..., 2]], dim=-1)
-            return offset.norm(dim=-1).nanmedian(dim=-1).values  # a start that failed leaves the others theirs
+            return offset.norm(dim=-1).nanmedian(dim=-1).values  # ignores starts that failed
         energy = self.model.field(condition, ends).energy
-        assert energy is not None  # of the constructor's check
+        assert energy is not None  # checked by the constructor
         return energy
 
     def _distance(self, condition: Tensor, pose: Tensor) -> Tensor:
-        """The distance `[B, N]` to the truth (radians, scene units) that the field tells, by Tweedie's formulas.
+        """Distance `[B, N]` to the truth (radians, scene units) estimated from the field by Tweedie's formulas.
 
-        The mean offset from the truth is -sigma^2 s (first order). Towards the antipode, where s vanishes, its slope s'
-        along the longitude is positive, and the mean square, sigma^4 (s^2 + s') + sigma^2 (second order), still tells
-        the distance; elsewhere that would only add the noise of a learned slope."""
+        The mean offset from the truth is -sigma^2 s (first order). Near the antipode s vanishes, but its slope s' along
+        the longitude is positive there, and the mean square sigma^4 (s^2 + s') + sigma^2 (second order) still gives the
+        distance. Elsewhere the second order would only add the noise of a learned slope."""
         variance = self.model.sigma**2
         step = 0.02 * variance * pose.new_tensor([0.0, 1.0, 0.0])
         score = self.model.field(condition, pose).score
@@ -143,12 +143,12 @@ class Langevin(Solver):
 def before_second_stage(
     model: PoseModel, alpha: float, gamma: float | Sequence[float], iterations: int, trajectory: bool = False
 ) -> Langevin:
-    """`Langevin`, of a model with densities at little smoothing, lest its modes become one."""
+    """`Langevin`, with little smoothing for models with densities so that their modes stay separate."""
     return Langevin(model, alpha, gamma, iterations, sigma=SHARP if model.has_density else None, trajectory=trajectory)
 
 
 def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:
-    """`sigma` of every step."""
+    """`sigma` at each step."""
     ends = [sigma] * 2 if isinstance(sigma, int | float) else [*sigma]
     fits = len(ends) == 2 and all(0 < each < math.inf for each in ends)
     check_settings("solver", ("sigma", sigma, fits, "one positive number, or two (the first and the last step's)"))
@@ -157,7 +157,7 @@ def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:
 
 
 def _triple(gamma: float | Sequence[float]) -> list[float]:
-    """`gamma` of latitude, longitude and radius, from three numbers or from one that is the longitude's."""
+    """`gamma` of latitude, longitude and radius, from three numbers or from one for the longitude."""
     triple = [0.0, float(gamma), 0.0] if isinstance(gamma, int | float) else [float(each) for each in gamma]
     fits = len(triple) == 3 and all(0 <= each < math.inf for each in triple)
     wanted = "one number (longitude) or three (latitude, longitude, radius), none negative"

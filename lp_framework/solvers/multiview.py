@@ -1,4 +1,4 @@
-"""The paper's Joint Reasoning across Multiple Views: one consistent set of poses for two and more images."""
+"""The paper's Joint Reasoning across Multiple Views: one consistent set of poses for two or more images."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
 from lp_framework.solvers.twist import TwistDescent, TwistPoses
 
-NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model does not tell it
+NEAREST = 0.1  # distance to the truth (radians, scene units) below which a model cannot resolve it
 
 
 class Joint(NamedTuple):
-    """N answers to each of S sets: `poses` `[S, N, V - 1, 3]` relative to the first image, `energies`
-    `[S, N, V, V]` of the ordered pairs (NaN: not looked at), `valid` `[S, N]`, and the `passes` they took."""
+    """N answers for each of S sets: `poses` `[S, N, V - 1, 3]` relative to the first image, `energies`
+    `[S, N, V, V]` of the ordered pairs (NaN: not computed), `valid` `[S, N]`, and the number of network `passes`."""
 
     poses: Tensor
     energies: Tensor
@@ -38,11 +38,11 @@ class Joint(NamedTuple):
 class MultiView(Solver):
     """Joint reasoning over 2 to 8 images: pairwise first stage, a robust fit of absolute poses, joint refinement.
 
-    All ends of the first stage are measurements for the fit, weighted by 1 / (d^2 + 0.1^2), with d the distance to the
-    truth that the model tells there (`choose_by=distance` of `langevin`). Where the model has densities, those of all
-    pairs are combined instead, as `langevin` does for sets. Without `first_stage` the second descends from the starts
-    themselves, number n of all images together, and the answer has the least energy on `rescoring` noises and
-    timesteps, the same for all. A pair is a set of two.
+    All final poses of the first stage are measurements for the fit, weighted by 1 / (d^2 + 0.1^2), where d is the
+    model's estimate of the distance to the truth (`choose_by=distance` of `langevin`). If the model has densities,
+    those of all pairs are combined instead, as `langevin` does for sets. Without `first_stage`, the second stage
+    descends from the starts (the n-th start of every image together), and the answer has the lowest energy over
+    `rescoring` noises and timesteps shared by all. A pair is a set of two.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class MultiView(Solver):
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve`: each pair as a set of two images; one pose a pair, or one a start without first stage."""
+        """See `Solver.solve`: each pair is a set of two; one pose per pair, or per start without the first stage."""
         views = torch.stack([pairs.reference, pairs.query], dim=1)
         view_sets = ViewSets(pairs.images, views, pairs.ids, pairs.field_of_view)
         joint = self._solve(view_sets, starts[:, None], seed)
@@ -83,7 +83,7 @@ class MultiView(Solver):
 
     @timed
     def solve_views(self, view_sets: ViewSets, starts: Tensor, seed: int) -> ViewSolution:
-        """See `Solver.solve_views`. A set is invalid when model or prior failed so that an image's pose is unknown."""
+        """See `Solver.solve_views`. A set is invalid if a failure of model or prior leaves an image's pose unknown."""
         joint = self._solve(view_sets, starts, seed)
         chosen = choose(joint.energies.nansum(dim=(-2, -1)).masked_fill(~joint.valid, torch.nan))
         sets = torch.arange(len(view_sets), device=chosen.device)
@@ -93,7 +93,7 @@ class MultiView(Solver):
     @torch.inference_mode(False)
     @torch.no_grad()
     def _solve(self, view_sets: ViewSets, starts: Tensor, seed: int) -> Joint:
-        """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one a start without."""
+        """All answers from starts `[S, V - 1, N, 3]`: one with the first stage, one per start without it."""
         if self.first_stage and self.model.has_density:
             found = self.first.solve_views(view_sets, starts, seed)
             poses, valid, passes = found.poses[:, None], found.valid[:, None], found.cost.network_passes
@@ -108,9 +108,9 @@ class MultiView(Solver):
         return self.refine(view_sets, joint, seed) if self.second_stage else joint
 
     def measure(self, view_sets: ViewSets, starts: Tensor, seed: int) -> tuple[Tensor, Tensor, int]:
-        """1. The first stage's ends (Eq. 4) on all ordered pairs, each from the starts of its query relative to its
-        reference: relative poses `[S, V, V, N, 3]` (row: reference, column: query), their weights `[S, V, V, N]` (0:
-        none), and the passes they took."""
+        """1. Run the first stage (Eq. 4) on all ordered pairs, each from the starts of its query relative to its
+        reference: relative poses `[S, V, V, N, 3]` (row: reference, column: query), their weights `[S, V, V, N]` (0 if
+        missing), and the number of network passes."""
         sets, views = view_sets.views.shape
         reference, query = torch.tensor(list(permutations(range(views), 2))).T.tolist()
         back = relative_pose(starts, torch.zeros_like(starts))
@@ -125,13 +125,13 @@ class MultiView(Solver):
         return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
     def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """2. What most ends agree on: one answer a set, `[S, 1, V - 1, 3]`, valid, `[S, 1]`, with all images known."""
+        """2. Fit poses to the measurements: one answer per set `[S, 1, V - 1, 3]`, and its validity `[S, 1]`."""
         poses = fit_views(measured, weights)[:, None, 1:].to(measured)
         known = (weights > 0).any(dim=-1)
         return poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True)
 
     def refine(self, view_sets: ViewSets, initial: Joint, seed: int) -> Joint:
-        """3. Joint descent (Eq. 5) from N sets of poses at once, by a twist for each image but the first."""
+        """3. Joint descent (Eq. 5) from N sets of poses at once, over a twist for each image except the first."""
         sets, _, others, _ = initial.poses.shape
         ends = list(zip(*combinations(range(others + 1), 2), strict=True))
         energy = PairEnergy(self.prior, view_sets.pairs(*ends), seed)  # both directions of an unordered pair
@@ -144,7 +144,7 @@ class MultiView(Solver):
 
         def relative(poses: Tensor) -> Tensor:
             """Relative poses `[S x pairs, N, 3]` of poses `[S, N, (V - 1) x 3]`."""
-            poses = pad(poses.unflatten(-1, (others, 3)), (0, 0, 1, 0))  # the first image's is 0
+            poses = pad(poses.unflatten(-1, (others, 3)), (0, 0, 1, 0))  # 0 for the first image
             return (poses[:, :, second] - poses[:, :, first]).transpose(1, 2).flatten(0, 1)
 
         def of_step(poses: Tensor, step: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The energy that the prior's solvers descend: its denoising error in both directions of a pair."""
+"""The energy minimized by the prior's solvers: the denoising error in both directions of a pair."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from lp_framework.keyed_random import keyed_normal, on_cpu, to_device
 from lp_framework.priors.base import Prior, ViewCode
 from lp_framework.solvers.base import Pairs
 
-_NOISE = 0x4E4F  # separates the prior's noise from a solver's other draws under the same seed
+_NOISE = 0x4E4F  # gives the prior's noise and a solver's other draws independent streams
 
 
 def keyed_noise(prior: Prior, device: torch.device, *keys: Tensor | int) -> Tensor:
-    """Standard normal noise `[..., *latent_shape]` (float32) for integer keys (on the CPU, lest the device be waited
-    for) that broadcast to `[...]`."""
+    """Standard normal noise `[..., *latent_shape]` (float32) for integer keys that broadcast to `[...]`; the keys are
+    on the CPU to avoid synchronizing with the device."""
     draws = keyed_normal(_NOISE, *keys, count=math.prod(prior.latent_shape))
     return to_device(draws.float().unflatten(-1, prior.latent_shape), device)
 
@@ -27,8 +27,8 @@ class PairEnergy:
     """The prior's denoising error of relative poses, averaged over both directions, for B pairs at once.
 
     Direction 0 predicts the query from the reference under the pose x, direction 1 the reference from the query under
-    -x. The images are encoded on construction, unless their codes are given. `passes` counts the samples that have
-    passed the network: encoded images, and two per pose and call.
+    -x. The images are encoded on construction unless `codes` is given. `passes` counts the samples passed through the
+    network: one per encoded image, two per pose and call.
     """
 
     def __init__(self, prior: Prior, pairs: Pairs, seed: int, codes: ViewCode | None = None) -> None:
@@ -45,13 +45,13 @@ class PairEnergy:
     def noise(self, step: int, count: int = 1) -> Tensor:
         """Standard normal noise `[B, count, 2, *latent_shape]` (float32) for both directions of each pair.
 
-        It is keyed by seed, pair, step, number (of `count`) and direction, so all starts of a pair see the same noise.
+        It is keyed by seed, pair, step, index (up to `count`) and direction, so all starts of a pair share it.
         """
         number, direction = torch.arange(count)[:, None], torch.arange(2)
         return keyed_noise(self.prior, self.pairs.ids.device, self.seed, self._ids, step, number, direction)
 
     def mean(self, poses: Tensor, timesteps: Sequence[int], noise: Tensor) -> Tensor:
-        """Mean energies `[B, N]` of poses `[B, N, 3]` over timesteps, each with its noise `[B, count, 2, ...]`."""
+        """Mean energies `[B, N]` of poses `[B, N, 3]` over timesteps, each with its own noise `[B, count, 2, ...]`."""
         energies = [self(poses, timestep, noise[:, number]) for number, timestep in enumerate(timesteps)]
         return torch.stack(energies).mean(dim=0)
 
@@ -61,8 +61,8 @@ class PairEnergy:
         return errors.unflatten(0, (*poses.shape[:2], 2)).mean(dim=-1)
 
     def residual(self, poses: Tensor, timestep: int, noise: Tensor) -> Tensor:
-        """Predicted minus true noise `[B, N, 2, elements of a latent]`, whose mean square is the energy; differentiable
-        in the poses `[B, N, 3]`, forward and backward."""
+        """Predicted minus true noise `[B, N, 2, latent elements]`, whose mean square is the energy; differentiable in
+        the poses `[B, N, 3]` in forward and reverse mode."""
         residual = self.prior.residual(*self._samples(poses, timestep, noise))
         return residual.flatten(1).unflatten(0, (*poses.shape[:2], 2))
 

@@ -1,4 +1,4 @@
-"""A bar for a solver's steps, where somebody waits for one solution; an evaluation has a bar of its own."""
+"""A progress bar for the steps of a single solve; evaluations have their own bar."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class Bars(Protocol):
-    """What shows progress, as `rich.progress.Progress` does."""
+    """The interface used to show progress; `rich.progress.Progress` implements it."""
 
     def track(self, sequence: range, *, description: str) -> Iterable[int]:
-        """The numbers of a range, each shown as it is handed out."""
+        """Iterate over a range and advance the bar."""
 
 
 _bars: ContextVar[Bars | None] = ContextVar("bars", default=None)
@@ -23,7 +23,7 @@ _bars: ContextVar[Bars | None] = ContextVar("bars", default=None)
 
 @contextmanager
 def shown_progress() -> Iterator[None]:
-    """Solvers that run inside show their steps on the terminal, if there is one; the bars go when they are done."""
+    """Show the steps of solvers on the terminal, if there is one; finished bars disappear."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with (
@@ -35,7 +35,7 @@ def shown_progress() -> Iterator[None]:
 
 @contextmanager
 def progress_in(bars: Bars) -> Iterator[None]:
-    """Solvers that run inside show their steps in these bars."""
+    """Show the steps of solvers in these bars."""
     token = _bars.set(bars)
     try:
         yield

@@ -15,11 +15,11 @@ from lp_framework.models.pose_model import PoseModel
 from lp_framework.registry import register
 from lp_framework.solvers.base import NetworkUser, Pairs
 
-_STARTS = 0x5747  # separates the draws of starts from a solver's own under the same seed
+_STARTS = 0x5747  # gives starts and solvers independent draws under the same seed
 
 
 class Starts(NetworkUser, ABC):
-    """Makes `count` initial poses per pair. The constructor may declare a `model` or a `prior`, as a solver's may."""
+    """Makes `count` initial poses per pair. The constructor may take a `model` or a `prior`, as for a solver."""
 
     count: int
 
@@ -27,13 +27,13 @@ class Starts(NetworkUser, ABC):
     def make(self, pairs: Pairs, seed: int) -> Tensor:
         """Relative poses `[B, count, 3]` (radians, radians, scene units), float32, on the device of the pairs.
 
-        The starts of a pair depend on its images, its id and `seed` alone.
+        The starts of a pair depend only on its images, its id and `seed`.
         """
 
 
 @register("start", "ring")
 class Ring(Starts):
-    """`count` longitudes evenly around the object, at one latitude (radians); iFusion's are 0, 90, 180, 270 degrees."""
+    """`count` evenly spaced longitudes at one latitude (radians); iFusion uses 0, 90, 180, 270 degrees."""
 
     def __init__(self, count: int = 4, latitude: float = 0.0) -> None:
         at_least(1, "start", count=count)
@@ -47,7 +47,7 @@ class Ring(Starts):
 
 @register("start", "grid")
 class Grid(Starts):
-    """Latitudes times longitudes (degrees); the paper's nine: -30, 0, 30 times 0, 120, 240."""
+    """A grid of latitudes and longitudes (degrees); the paper's nine are -30, 0, 30 times 0, 120, 240."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class Random(Starts):
 
 @register("start", "modes")
 class Modes(Starts):
-    """The `count` most likely relative poses that the model itself tells, best first (`model=matching`)."""
+    """The `count` most likely relative poses under the model's density, best first (`model=matching`)."""
 
     def __init__(self, model: PoseModel, count: int = 4) -> None:
         at_least(1, "start", count=count)

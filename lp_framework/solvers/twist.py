@@ -1,8 +1,8 @@
-"""iFusion (Wu et al. 2023): a query's pose by descending a pose-conditioned diffusion prior's energy over twists.
+"""iFusion (Wu et al. 2023): gradient descent on the energy of a pose-conditioned diffusion prior, over twists.
 
-A relative pose is the camera at (latitude, longitude, norm) around a canonical object, whose norm stands for the
-relative radius by a *radius map*. It moves by a twist xi `[..., 6]`, translation first: T = T_start exp(xi); latitude,
-longitude and norm are read back from the translation of T.
+A relative pose is represented by a camera at (latitude, longitude, norm) around a canonical object; a *radius map*
+converts between norm and relative radius. A twist xi `[..., 6]`, translation first, moves it: T = T_start exp(xi).
+Latitude, longitude and norm are read back from the translation of T.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ ChooseBy = Literal["accumulated", "rescored"]
 
 
 class SineRadius:
-    """iFusion's: radius = 0.8 sin(norm - 1). It reaches 0.8, where its slope is 0, and at norm 0 down to -0.67.
+    """iFusion's map: radius = 0.8 sin(norm - 1). Its maximum is 0.8, where the slope is 0; at norm 0 it is -0.67.
 
-    As of every radius map, `radius` is elementwise and differentiable, and `norm` is its inverse for starts' radii.
+    For every radius map, `radius` is elementwise and differentiable, and `norm` is its inverse on the starts' radii.
     """
 
     REACH = 0.8
@@ -39,16 +39,16 @@ class SineRadius:
         return self.REACH * (norm - 1).sin()
 
     def norm(self, radius: Tensor) -> Tensor:
-        """`UserError` where no norm stands for it."""
+        """Raises `UserError` for a radius without a norm."""
         if ((radius <= self.LEAST) | (radius >= self.REACH)).any():
             raise UserError(f"this solver takes starts with relative radii between {self.LEAST:.2f} and {self.REACH}")
         return 1 + (radius / self.REACH).asin()
 
 
 class TanhRadius:
-    """radius = tanh(log norm) = (norm^2 - 1) / (norm^2 + 1): 0 at norm 1, as iFusion's, but with an inverse.
+    """radius = tanh(log norm) = (norm^2 - 1) / (norm^2 + 1): 0 at norm 1 like iFusion's, but invertible.
 
-    Starts are brought within `LIMIT` of 0: views at radii from 1.2 to 2.0 differ by no more.
+    Starts are clamped to within `LIMIT` of 0: the radii of views, 1.2 to 2.0, differ by no more than that.
     """
 
     LIMIT = 0.8
@@ -64,10 +64,10 @@ RadiusMap = SineRadius | TanhRadius
 
 
 class TwistPoses:
-    """Relative poses `[..., 3]` of twists `[..., 6]` from starts `[..., 3]`, which are those of zero twists.
+    """Map twists `[..., 6]` to relative poses `[..., 3]`; a zero twist gives the start `[..., 3]`.
 
-    A relative latitude may be of any size, a camera's may not, and near the poles its longitude is worth little: a
-    start's camera is at most `HIGHEST` (radians) high, and the rest is added to what is read back.
+    A relative latitude can have any size, but a camera's cannot, and its longitude is ill-conditioned near the poles.
+    The latitude of a start's camera is therefore clamped to `HIGHEST` (radians); the rest is added when reading back.
     """
 
     HIGHEST = math.pi / 3
@@ -88,10 +88,10 @@ class TwistPoses:
 
 @dataclass(eq=False)
 class TwistDescent(Solver):
-    """iFusion's descent of the prior's energy from every start: twists by Adam, the timestep falling with the step.
+    """iFusion's descent on the prior's energy from every start: Adam on twists, with a decreasing timestep.
 
-    `choose_by`: `accumulated`, the least sum of the losses on the way (published); `rescored`, the least mean error of
-    the final poses on `rescoring` noises and timesteps that are the same for all starts of a pair.
+    `choose_by`: `accumulated`, the lowest sum of losses along the trajectory (published); `rescored`, the lowest mean
+    error of the final pose over `rescoring` noises and timesteps shared by all starts of a pair.
     """
 
     prior: Prior
@@ -123,7 +123,7 @@ class TwistDescent(Solver):
     @torch.inference_mode(False)
     @torch.no_grad()
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve`. A start whose energy or gradient is not finite stops at its last pose and is invalid."""
+        """See `Solver.solve`. A start with a non-finite energy or gradient stops at its last pose and is invalid."""
         energy = PairEnergy(self.prior, pairs, seed)
 
         def of_step(poses: Tensor, step: int) -> Tensor:
@@ -142,27 +142,27 @@ class TwistDescent(Solver):
         return Solution(ends, energies, valid, choose(energies), Cost(energy.passes), trajectory=path)
 
     def timestep(self, done: float) -> int:
-        """The timestep when a share `done` in [0, 1) of the way from the first to the last is behind."""
+        """The timestep at fraction `done` in [0, 1) of the schedule from `first_timestep` to `last_timestep`."""
         span = self.first_timestep + 1 - self.last_timestep
         return min(round(self.last_timestep + (1 - done) * span), self.first_timestep)
 
     def rescoring_timesteps(self) -> list[int]:
-        """Those on which final poses are compared, spread over the whole way."""
+        """The timesteps for comparing final poses, spread over the whole schedule."""
         return [self.timestep((number + 0.5) / self.rescoring) for number in range(self.rescoring)]
 
     def descend(self, energy: Energy, pose_of: Callable[[Tensor], Tensor], twist: Tensor) -> Descended:
-        """`descent.descend` by Adam and the plateau schedule, from twists `[B, N, D]`."""
+        """Run `descent.descend` with Adam and the plateau schedule from twists `[B, N, D]`."""
         adam = Adam(twist, self.learning_rate)
         return descend(energy, pose_of, twist, self.steps, adam, Plateau(adam, self.factor, self.patience))
 
 
 @register("solver", "ifusion")
 class IFusion(TwistDescent):
-    """iFusion: Adam on a twist for each start, down the prior's energy in both directions.
+    """iFusion: Adam on a twist for each start, minimizing the prior's energy in both directions.
 
-    Defaults are the published settings; its starts are `ring`. The plateau schedule is fed with the accumulated loss,
-    as in the published code, so the rate is multiplied by `factor` after the first `patience` + 2 steps and then every
-    `patience` + 1. Left out: the published code drops each condition in 5% of the steps.
+    Defaults are the published settings; use with `start=ring`. As in the published code, the plateau schedule gets the
+    accumulated loss, so the rate is multiplied by `factor` after the first `patience` + 2 steps and then every
+    `patience` + 1. Unlike the published code, conditions are never dropped (there: each in 5% of the steps).
     """
 
     radius_map = SineRadius()

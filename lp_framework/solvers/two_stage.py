@@ -1,4 +1,4 @@
-"""The paper's method, a learned score and then the prior's energy; and ours, with Gauss-Newton for the latter."""
+"""The paper's method, a learned score followed by the prior's energy; and our variant, with Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
 from lp_framework.solvers.twist import ChooseBy, TanhRadius, TwistDescent
 
-LONGEST_STEP = 0.5  # radians and scene units; the prior is not to be left where it hardly depends on the pose
+LONGEST_STEP = 0.5  # radians and scene units; longer steps may end where the prior hardly depends on the pose
 
 
 @register("solver", "two_stage")
 class TwoStage(Solver):
-    """The paper's method: `langevin` on a score or energy model, then iFusion's descent of the prior from its ends.
+    """The paper's method: `langevin` on a score or energy model, then iFusion's descent on the prior from there.
 
-    Defaults are the paper's (appendix, Two Stage Optimization); the second stage's settings are those of `ifusion`, its
-    radii go by `TanhRadius`, since the first may end at any. Without refinement steps it is the first stage alone.
+    Defaults are the paper's (appendix, Two Stage Optimization). The second stage has the settings of `ifusion`, but
+    uses `TanhRadius` because the first may end at any radius. With no refinement steps, only the first stage runs.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class TwoStage(Solver):
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve`. A start is invalid when the model or the prior failed on its way."""
+        """See `Solver.solve`. A start is invalid if the model or the prior failed."""
         first = self.first.solve(pairs, starts, seed)
         if self.second.steps == 0:
             return first
@@ -64,11 +64,11 @@ class TwoStage(Solver):
 
 
 def in_a_row(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
-    """The solution of `second` from the ends of `first` `[B, N, 3]`, with trajectory and cost of both.
+    """Run `second` from the final poses of `first` `[B, N, 3]`; trajectory and cost cover both stages.
 
-    A start is invalid where either failed; where the first did, it stays there.
+    A start is invalid if either stage failed; if the first did, it keeps the first stage's pose.
     """
-    # A start that failed goes along at the origin, so that the others stay in their places.
+    # Starts that failed are replaced by the origin, to keep the batch's shape.
     after = second(first.poses.masked_fill(~first.valid[..., None], 0.0))
     energies = after.energies.masked_fill(~first.valid, torch.nan)
     poses = torch.where(first.valid[..., None], after.poses, first.poses)
@@ -78,13 +78,13 @@ def in_a_row(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
 
 
 def _joined(first: Tensor | None, second: Tensor | None) -> Tensor | None:
-    """Both trajectories, the second's longitudes in the turn where the first ended; the hand-over counts once."""
+    """Concatenate the trajectories, with longitudes continuous across the two; the shared pose appears once."""
     if first is None or second is None:
         return None
     after = second[:, :, 1:]
     turns = ((first[:, :, -1:, 1] - second[:, :, :1, 1]) / (2 * math.pi)).round()
     after = torch.stack([after[..., 0], after[..., 1] + 2 * math.pi * turns, after[..., 2]], dim=-1)
-    return torch.cat([first, after], dim=2)  # where the first stage failed the turns are NaN
+    return torch.cat([first, after], dim=2)  # `turns` is NaN where the first stage failed
 
 
 class Quadratic(NamedTuple):
@@ -99,12 +99,12 @@ class Quadratic(NamedTuple):
 class GaussNewton(Solver):
     """Ours: first stage `langevin`, then Levenberg-Marquardt on the prior's residuals, all starts at once.
 
-    A pair's energy is a mean of squares, of the residuals of both directions under one noise for each of `timesteps`,
-    drawn once: every step descends the same function. Its Jacobian is by forward-mode derivatives (eight passes a
-    timestep), which the prior has to have under `torch.func.vmap`. Every start has a damping of its own (Nielsen 1999).
+    A pair's energy is the mean square of the residuals in both directions, with one noise per entry of `timesteps`,
+    drawn once so that every step minimizes the same function. The Jacobian uses forward-mode AD (eight passes per
+    timestep), which the prior must support under `torch.func.vmap`. Each start has its own damping (Nielsen 1999).
 
-    Steps are at most 0.5 long, radii keep within what views have. The quadratic model wants a start near the bottom, so
-    `gamma` is 0 here; with the paper's 0.3 the far ends need some ten steps more.
+    Steps are at most 0.5 long, and radii stay within the range of views. The quadratic model needs a start near the
+    minimum, so `gamma` defaults to 0; with the paper's 0.3, distant starts need about ten more steps.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class GaussNewton(Solver):
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
-        """See `Solver.solve`. Energies are those descended; a start is invalid when the model or the prior failed."""
+        """See `Solver.solve`. Energies are those minimized; a start is invalid if the model or the prior failed."""
         first = self.first.solve(pairs, starts, seed)
         return in_a_row(first, lambda ends: self.refine(pairs, ends, seed))
 
@@ -186,7 +186,7 @@ class GaussNewton(Solver):
 
             before = energy.passes
             jacobian, value = torch.func.jacfwd(residual, has_aux=True)(pose.new_zeros(3))  # [B, N, M, 3], [B, N, M]
-            energy.passes += 3 * (energy.passes - before)  # the derivatives' share
+            energy.passes += 3 * (energy.passes - before)  # for the derivatives
             gradient = (jacobian * value[..., None]).mean(dim=-2)
             hessian = (jacobian[..., None] * jacobian[..., None, :]).mean(dim=-3)
             parts.append(Quadratic(value.square().mean(dim=-1), gradient, hessian))
@@ -194,5 +194,5 @@ class GaussNewton(Solver):
 
 
 def _plausible(poses: Tensor) -> Tensor:
-    """Poses `[..., 3]` with radii that views differ by."""
+    """Clamp the relative radii of poses `[..., 3]` to the range of views."""
     return torch.cat([poses[..., :2], poses[..., 2:].clamp(-TanhRadius.LIMIT, TanhRadius.LIMIT)], dim=-1)
