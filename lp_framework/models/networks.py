@@ -9,7 +9,7 @@ from torch import Tensor, nn
 class PoseEmbedding(nn.Module):
     """Sines and cosines of a relative pose `[..., 3]` at doubling frequencies: `[..., 6 * frequencies]`.
 
-    With `periodic` longitudes 0 and 2 pi are embedded alike; the paper's target on the line tells them apart.
+    With `periodic`, longitudes 0 and 2 pi have the same embedding; the paper's target on the line distinguishes them.
     """
 
     def __init__(self, frequencies: int = 4, periodic: bool = True) -> None:
@@ -38,7 +38,7 @@ class ResidualLayer(nn.Module):
 class PoseNetwork(nn.Module):
     """Residual MLP on (reference features, query features, embedded pose): `[..., outputs]`.
 
-    The first layer is kept as one linear map an input, so that an image's part is computed once (`project`).
+    The first layer is split into one linear map per input, so that the image part is computed only once (`project`).
     """
 
     def __init__(

@@ -30,7 +30,7 @@ class PoseKernel:
             raise UserError(f"sigma must be above 0, got {sigma}")
         self.sigma = sigma
         self.periodic = target == "periodic"
-        # Images of the truth further than 8 sigma away weigh less than float64's epsilon.
+        # Images of the truth more than 8 sigma away have a weight below float64's epsilon.
         self._turns = math.ceil(0.5 + 8 * sigma / TURN) if self.periodic else 0
 
     def _images(self, noised: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
@@ -57,10 +57,10 @@ class PoseKernel:
 
 
 class NoisedPose:
-    """How the noised pose is drawn for training.
+    """Sampler of noised poses for training.
 
     `uniform` over a box (the paper's choice): the optimum is the mean of the kernel's scores over all answers
-    (Lemma 1). `gaussian` around the truth: the optimum weighs the answers by their posterior (Proposition 1).
+    (Lemma 1). `gaussian` around the truth: the optimum weights the answers by their posterior (Proposition 1).
     """
 
     def __init__(self, noise: str, sigma: float, low: Sequence[float], high: Sequence[float]) -> None:
@@ -73,12 +73,12 @@ class NoisedPose:
         self.low, self.high = list(low), list(high)
 
     def draw(self, true: Tensor, generator: torch.Generator) -> Tensor:
-        """Noised poses `[P, 3]` for true relative poses `[P, 3]`, with a generator on the CPU."""
+        """Draw noised poses `[P, 3]` for true relative poses `[P, 3]`, with a generator on the CPU."""
         if self.noise == "gaussian":
             return true + self.sigma * torch.randn(true.shape, generator=generator).to(true)
         return self.place(torch.rand(true.shape, generator=generator)).to(true)
 
     def place(self, unit: Tensor) -> Tensor:
-        """Uniform draws in [0, 1] `[..., 3]` stretched over the box."""
+        """Map uniform draws in [0, 1] `[..., 3]` to the box."""
         low, high = unit.new_tensor(self.low), unit.new_tensor(self.high)
         return low + unit * (high - low)

@@ -1,4 +1,4 @@
-"""Metrics on the CPU, and the mean of a value that each pair has, counted once whatever the number of processes."""
+"""Metrics on the CPU, and a mean over pairs that counts each pair once for any number of processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def first_of_each(pairs: Tensor) -> Tensor:
 
 
 class HostMetric(Metric):
-    """A metric whose states stay on the CPU wherever its module goes: they are float64, which not every device has."""
+    """A metric whose states stay on the CPU when its module is moved: not every device supports their float64."""
 
     full_state_update = False
 
@@ -30,19 +30,19 @@ class HostMetric(Metric):
         super().__init__(dist_sync_fn=gathered)
 
     def _apply(self, *_: Any, **__: Any) -> HostMetric:
-        """Called by `torch.nn.Module` to move it."""
+        """Ignore moves by `torch.nn.Module`."""
         return self
 
 
 def gathered(value: Tensor, group: Any = None) -> list[Tensor]:
-    """`value` of every process; as an object, since a GPU's backend exchanges no tensors of the CPU."""
+    """Gather `value` from all processes, as an object because GPU backends cannot exchange CPU tensors."""
     values = [value] * distributed.get_world_size(group)
     distributed.all_gather_object(values, value, group=group)
     return values
 
 
 class PairMean(HostMetric):
-    """Mean over pairs; several processes pad their share with repeated pairs, which count once."""
+    """Mean over pairs; pairs repeated to pad the shares of several processes count once."""
 
     pair: list[Tensor]
     value: list[Tensor]

@@ -21,13 +21,13 @@ from lp_framework.models.trained_module import TrainedModule
 from lp_framework.models.view_head import relative_pose_loss
 from lp_framework.registry import register
 
-VALIDATION_NOISES = 4  # noised poses a validation pair
+VALIDATION_NOISES = 4  # noised poses per validation pair
 # Relative poses of views with latitudes in [-30, 30] degrees and radii in [1.2, 2.0].
 LOW, HIGH = (-math.pi / 3, 0.0, -0.8), (math.pi / 3, 2 * math.pi, 0.8)
 
 
 class FieldValue(NamedTuple):
-    """The value of a model at given poses: `score` `[..., 3]` and, for energy models, `energy` `[...]`."""
+    """The output of a model at given poses: `score` `[..., 3]` and, for energy models, `energy` `[...]`."""
 
     score: Tensor
     energy: Tensor | None
@@ -37,16 +37,16 @@ class PoseModel(TrainedModule):
     """A score or energy of the relative pose, given two images.
 
     Solvers call `encode` once per image, `condition` once per pair, and then `field` at any poses. *Codes* are tensors
-    or any objects that can be indexed like a batch, `codes[pairs.reference]`. A *condition* is a tensor or any object
-    that can be indexed along the pairs and given further dimensions, `condition[:, None]`, to broadcast against poses
+    or other objects that can be indexed like a batch, `codes[pairs.reference]`. A *condition* is a tensor or another
+    object that can be indexed along the pairs and unsqueezed, `condition[:, None]`, to broadcast against poses
     `[B, N, 3]`.
     """
 
-    sigma: float  # radians and scene units: the field's score is (truth - x) / sigma^2 near an only truth
+    sigma: float  # radians and scene units: the score is (truth - x) / sigma^2 near the truth if it is unique
     kernel: PoseKernel  # of the noise
-    has_energy: bool  # whether `field` gives an energy beside the score
+    has_energy: bool  # whether `field` also returns an energy
     has_density = False  # whether conditions are `PoseDensity`, normalised and known at every sigma
-    choose_by: Literal["distance", "energy"] = "distance"  # what tells the best of several ends, see solver=langevin
+    choose_by: Literal["distance", "energy"] = "distance"  # how to pick the best final pose, see solver=langevin
 
     @abstractmethod
     def encode(self, images: Tensor) -> Any:
@@ -54,7 +54,7 @@ class PoseModel(TrainedModule):
 
     @abstractmethod
     def condition(self, reference: Any, query: Any) -> Any:
-        """The condition of P pairs, from the codes of their references and queries."""
+        """The condition of P pairs, given the codes of their references and queries."""
 
     @abstractmethod
     def field(self, condition: Any, pose: Tensor) -> FieldValue:
@@ -72,7 +72,7 @@ class PoseModel(TrainedModule):
         return None
 
     def at_sigma(self, condition: Any, sigma: float) -> Any:
-        """The condition under which `field` is at another `sigma`; `UserError` if the model knows only one."""
+        """The condition for evaluating `field` at another `sigma`; `UserError` if the model has only one."""
         raise UserError(
             "solver.sigma needs model=matching, whose field is known at every sigma; that of score and energy networks "
             f"is known only at the sigma of their training, {self.sigma:g}"
@@ -80,7 +80,7 @@ class PoseModel(TrainedModule):
 
 
 class DenoisingModel(PoseModel):
-    """A network on the pooled features of two images; a subclass says what its output means."""
+    """A network on the pooled features of two images; subclasses define the meaning of its output."""
 
     outputs: int  # of the network
 
@@ -112,7 +112,7 @@ class DenoisingModel(PoseModel):
         self.network = PoseNetwork(
             backbone.feature_dim, self.outputs, hidden, layers, frequencies, self.kernel.periodic, dropout
         )
-        # The linear readout of `relative_pose_loss`, by the name that it has in checkpoints.
+        # The linear readout of `relative_pose_loss`; checkpoints contain it under this name.
         self.view_head = nn.ModuleDict({"readout": nn.Linear(backbone.feature_dim, 4)} if view_loss > 0 else {})
         self.view_loss = view_loss
         self.validation_loss = PairMean()
@@ -122,7 +122,7 @@ class DenoisingModel(PoseModel):
         return self.backbone(images)
 
     def condition(self, reference: Tensor, query: Tensor) -> Tensor:
-        """The condition `[P, hidden]` of P pairs, from codes `[P, D]` of either side."""
+        """The condition `[P, hidden]` of P pairs, given codes `[P, D]` of references and queries."""
         return self.network.project(reference, query)
 
     @abstractmethod
@@ -158,7 +158,7 @@ class DenoisingModel(PoseModel):
         return self.encode(batch.images)
 
     def _validation_noise(self, true: Tensor, pairs: Tensor) -> Tensor:
-        """Noised poses keyed by pair: the same in every epoch, batching and number of processes."""
+        """Noised poses keyed by pair: independent of epoch, batch size and number of processes."""
         count = true.shape[1] * 3
         if self.noised_pose.noise == "gaussian":
             return true + self.noised_pose.sigma * keyed_normal(self.seed, pairs, count=count).view(true.shape).to(true)
@@ -191,7 +191,7 @@ class EnergyModel(DenoisingModel):
         return self.network(condition, pose).squeeze(-1)
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
-        """The score is minus the energy's gradient in the pose."""
+        """The score is the negative gradient of the energy with respect to the pose."""
         with torch.inference_mode(False), torch.enable_grad():
             # Clones, because tensors made in inference mode cannot take part in autograd.
             variable = pose.detach().clone().requires_grad_()

@@ -1,4 +1,4 @@
-"""What all trained modules share: optimiser and rate, keyed noise, and checkpoints without the frozen trunk."""
+"""Base class of all trained modules: optimizer and schedule, keyed noise, checkpoints without the frozen trunk."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from lp_framework.errors import UserError, at_least
 from lp_framework.models.backbones import Backbone
 
 RECIPE = "lp_framework"  # key in a checkpoint: the configs of model and backbone, by registered name
-WEIGHTS = {"state_dict", "current_model_state"}  # where a checkpoint has weights; the second is of a moving average
+WEIGHTS = {"state_dict", "current_model_state"}  # keys of weights in a checkpoint; the second with a moving average
 
 
 class TrainedModule(LightningModule):
-    """A LightningModule on a backbone. With its `recipe` every checkpoint tells how to build it again."""
+    """A LightningModule on a backbone. Checkpoints contain its `recipe`, from which it can be rebuilt."""
 
     recipe: Mapping[str, Any] | None = None
 
-    carries_points = False  # whether its batches have the points in space that their views show
+    carries_points = False  # whether its batches include the 3-D points visible in their views
 
     def __init__(
         self,
@@ -39,24 +39,24 @@ class TrainedModule(LightningModule):
         self.backbone = backbone
         self.optimizer, self.learning_rate, self.weight_decay = optimizer, learning_rate, weight_decay
         self.schedule, self.seed = schedule, seed
-        self._micro_batch = 0  # of an optimiser step, with trainer.accumulate_grad_batches
+        self._micro_batch = 0  # index within an optimizer step, for trainer.accumulate_grad_batches
 
     def extractor(self) -> FeatureExtractor | None:
-        """What of an image the data module shall compute once and cache: the frozen trunk's features; else nothing."""
+        """The feature extractor whose outputs the data module caches: the frozen trunk, or None if it is trained."""
         return self.backbone if self.backbone.frozen else None
 
     def on_train_batch_start(self, batch: PairBatch, batch_idx: int) -> None:
-        """Dropout draws from the global generator: keyed as the noise is, apart from it."""
+        """Seed the global generator for dropout, with the same keys as the noise but a separate stream."""
         self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
         torch.manual_seed(self._step_key() + (1 << 62))
 
     def _generator(self) -> torch.Generator:
-        """Noise keyed by seed, step, micro-batch and process, so resumed runs draw the same; on the CPU."""
+        """A CPU generator keyed by seed, step, micro-batch and process, so that resumed runs draw the same noise."""
         return torch.Generator().manual_seed(self._step_key())
 
     def _step_key(self) -> int:
         step = (self.seed * 1_000_003 + self.global_step) * 1_009 + self.global_rank
-        return step + 0x9E3779B9 * self._micro_batch  # far apart in the 32 bits that a generator on the CPU heeds
+        return step + 0x9E3779B9 * self._micro_batch  # far apart in the 32 bits that a CPU generator uses
 
     def configure_optimizers(self) -> Any:
         parameters = [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -74,7 +74,7 @@ class TrainedModule(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A frozen trunk comes with its backbone: its fingerprint is kept, its weights are left out."""
+        """Save the recipe; for a frozen trunk, save its fingerprint instead of its weights."""
         checkpoint[RECIPE] = self.recipe
         if not self.backbone.frozen:
             return
@@ -84,7 +84,7 @@ class TrainedModule(LightningModule):
             checkpoint[state] = {key: value for key, value in checkpoint[state].items() if key not in trunk}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Put the frozen trunk's weights back; `UserError` where the rest was trained on another trunk."""
+        """Restore the frozen trunk's weights; raises `UserError` if the model was trained on another trunk."""
         if not self.backbone.frozen:
             return
         if checkpoint.get("trunk") != self.backbone.fingerprint():

@@ -1,8 +1,8 @@
-"""A second, linear readout of the features that shows training the way to the relative pose. Ours, not the paper's.
+"""An auxiliary linear readout of the relative pose from the features, for training. Ours, not the paper's.
 
-Where the features do not tell the longitude yet, the score objective has a saddle and training stays there for long.
-This readout maps a view's features to a complex number u, a latitude and a radius, and asks that a pair's differences
-be right: u_q conj(u_r) = exp(i dlongitude). `model.view_loss=0` is the paper's objective.
+As long as the features contain no longitude, the score objective has a saddle point where training stalls. This readout
+maps a view's features to a complex number u, a latitude and a radius, and penalises errors of a pair's differences; for
+the longitude, u_q conj(u_r) should be exp(i dlongitude). `model.view_loss=0` gives the paper's objective.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ SCALE = (2.0, 3.0)
 
 
 def scaled(pose: Tensor) -> Tensor:
-    """Latitudes and radii `[..., 2]` of relative poses `[..., 3]`, each times its `SCALE`."""
-    # Times numbers: a tensor of them would be sent to the device at every step.
+    """Latitudes and radii `[..., 2]` of relative poses `[..., 3]`, each multiplied by its `SCALE`."""
+    # Plain numbers, because a tensor would be copied to the device at every step.
     return torch.stack([pose[..., 0] * SCALE[0], pose[..., 2] * SCALE[1]], dim=-1)
 
 
 def relative_pose_loss(readout: Tensor, batch: PairBatch) -> Tensor:
-    """Mean squared error of the batch's relative poses, a scalar, by the `readout` `[I, 4]` of its views: real and
+    """Mean squared error of the batch's relative poses (a scalar), given the `readout` `[I, 4]` of its views: real and
     imaginary part of the longitude's phase, scaled latitude and radius."""
-    readout, true = readout.float(), batch.relative_poses()  # complex numbers have no bfloat16
+    readout, true = readout.float(), batch.relative_poses()  # there are no complex bfloat16 numbers
     phase = torch.complex(readout[:, 0], readout[:, 1])
     turn = phase[batch.query] * phase[batch.reference].conj()
     difference = readout[batch.query, 2:] - readout[batch.reference, 2:]
