@@ -1,13 +1,13 @@
-"""Camera viewpoint between photographs of one object, found on learned landscapes of the relative pose.
+"""Estimate the camera viewpoint between photographs of one object on learned landscapes of the relative pose.
 
     pose = lp_framework.estimate_pose("chair_front.png", "chair_left.png").answer()
 
-    model = lp_framework.load_model("runs/train/2026-01-31_12-00-00")  # without an argument, the one that ships
+    model = lp_framework.load_model("runs/train/2026-01-31_12-00-00")  # default: the bundled model
     solver = lp_framework.load_solver("two_stage", model=model, prior=lp_framework.load_prior("tiny"), gamma=0)
     starts = lp_framework.make_starts("grid")
 
-Names and arguments are those of the command line. Importing the package imports nothing heavy; the functions are those
-of `lp_framework.api`, which is imported when one of them is used.
+Names and arguments are the same as on the command line. Importing the package is cheap: `lp_framework.api`, which
+defines the functions, is imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,4 @@
-"""The Python API, which `lp_framework` exports, and what it shares with the commands on photographs."""
+"""The Python API exported by `lp_framework`, and functions it shares with the commands on photographs."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def estimate_pose(
 
     A picture is a file, a Pillow image or an array `[H, W, 3 | 4]` (uint8, or floats in [0, 1]). The object is cut out
     by the alpha channel, or by a mask made with `remove_background=True`, then centred and scaled. With `crop=False` a
-    picture is a whole square view, on white if it has no alpha channel.
+    picture must be a whole square view, on white if it has no alpha channel.
 
-    `solver`, `prior` and `starts` are registered names or objects built by the functions below. A solver chosen by name
+    `solver`, `prior` and `starts` are registered names or objects built by the functions below. A solver given by name
     gets the prior and the model that it needs, on the GPU if there is one; a built solver keeps its own. `model` is the
-    name of weights that ship, a checkpoint, the folder of a training run, or a model.
+    name of bundled weights, a checkpoint, the folder of a training run, or a model.
 
-    If the model has a density, as `general` has, the result's `probability` is that of being within 30 degrees of the
-    truth, and the relative radius is 0, because the crop loses the distance.
+    If the model has a density, as `general` does, `probability` of the result is the probability of an error of at most
+    30 degrees, and the relative radius is 0, because cropping discards the distance.
 
     Raises `UserError` for a picture that cannot be read or has no object, and for an unknown name.
     """
@@ -79,7 +79,7 @@ def estimate_pose(
 
 
 def load_model(checkpoint: str | Path = "score") -> PoseModel:
-    """Load a trained model by the name of weights that ship, a checkpoint file, a training run's folder or a hub id."""
+    """Load a trained model from bundled weights (by name), a checkpoint file, a training run's folder or a hub id."""
     return read_model(checkpoint)
 
 
@@ -105,7 +105,7 @@ def make_starts(name: str, model: PoseModel | None = None, prior: Prior | None =
 
 
 def _settings(group: str, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a registered name or of a preset in `conf/`, with those given over them."""
+    """The settings of a registered name or of a preset in `conf/`, overridden by `arguments`."""
     preset = {"name": name} if name in registry.names(group) else catalogue.values(group, name)
     return {**preset, **arguments}
 
@@ -113,7 +113,7 @@ def _settings(group: str, name: str, arguments: dict[str, Any]) -> dict[str, Any
 def _components(
     choices: Sequence[tuple[str, object]], prior: str | Prior, model: str | Path | PoseModel
 ) -> dict[str, Any]:
-    """The prior and the model where a choice of a group by name asks for them, each loaded once."""
+    """Load the prior and the model, each once, if a component chosen by name needs them."""
     named = [
         registry.get(group, _settings(group, name, {})["name"]) for group, name in choices if isinstance(name, str)
     ]
@@ -129,35 +129,35 @@ def _components(
 
 
 def open_picture(picture: str | Path | Image.Image | ArrayLike, name: str) -> Image.Image:
-    """A file, an image of Pillow or an array `[H, W, 3 | 4]` as RGB or RGBA; `name` is what errors call it."""
+    """Open a file, a Pillow image or an array `[H, W, 3 | 4]` as RGB or RGBA; errors refer to it as `name`."""
     if isinstance(picture, str | Path):
         return read_image(picture)
     if isinstance(picture, Image.Image):
         try:
             return upright(picture)
-        except (OSError, ValueError) as error:  # files are read late
+        except (OSError, ValueError) as error:  # Pillow reads files lazily
             raise UserError(f"{name}: {error}") from error
     return array_image(picture, name)
 
 
 def image_batch(prepared: Sequence[Image.Image]) -> Tensor:
-    """Images `[I, 3, H, W]` in [-1, 1], on white, of prepared ones (RGBA, all of one size)."""
+    """Convert prepared images (RGBA, all of one size) to `[I, 3, H, W]` in [-1, 1] on white."""
     return as_images(torch.from_numpy(np.stack([on_white(image) for image in prepared])))
 
 
 def view_set(prepared: Sequence[Image.Image], device: torch.device) -> ViewSets:
-    """The prepared photographs of one object as the one set of views to solve."""
+    """Prepared photographs of one object as a single set of views."""
     views = torch.arange(len(prepared), device=device)[None]
     return ViewSets(image_batch(prepared).to(device), views, ids=torch.zeros_like(views[:, 0]))
 
 
 def best_device() -> torch.device:
-    """The GPU where there is one (CUDA, or Apple's), else the CPU."""
+    """The GPU (CUDA or Apple) if there is one, otherwise the CPU."""
     found = torch.accelerator.current_accelerator() if torch.accelerator.is_available() else None
     return torch.device("cpu") if found is None else torch.device(found.type)
 
 
 def move(user: Solver | Starts, device: torch.device) -> None:
-    """Move the networks that a solver or starts were given to a device."""
+    """Move the networks of a solver or starts to a device."""
     for part in user.networks():
         part.to(device)

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and what is said where that fails."""
+"""Atomic file writing, with clear errors on failure."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class DiskFull(UserError):
-    """There is no room for a file, nor would there be for the next one."""
+    """The disk is full, so writing further files would fail as well."""
 
 
 def reason(error: Exception, path: Path) -> str:
-    """Why `path` cannot be written; of a full disk, how much space is not enough."""
+    """Why `path` cannot be written; for a full disk, including the remaining space."""
     text = getattr(error, "strerror", None) or str(error)
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         existing = next(each for each in (path, *path.absolute().parents) if each.exists())
@@ -31,7 +31,7 @@ def reason(error: Exception, path: Path) -> str:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Make a `UserError` that names `path` of what goes wrong in writing to it, `DiskFull` for want of room."""
+    """Turn errors in writing to `path` into a `UserError` that names it, or `DiskFull` if the disk is full."""
     try:
         yield
     except (OSError, SafetensorError) as error:
@@ -41,11 +41,11 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """A hidden file beside `path` to write to; it replaces `path` at the end, and is removed where that fails.
+    """A hidden file beside `path` to write to; it replaces `path` at the end, or is removed on failure.
 
-    `UserError` that names `path` where it cannot be written.
+    Raises `UserError` with the name of `path` if it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # another process has another
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # one per process
     with writing(path):
         try:
             yield partial

@@ -1,7 +1,7 @@
-"""What can be chosen and set: the YAML files of the conf folders, and the signatures of plugins that bring none.
+"""All choices and settings: the YAML files of the conf folders, and the signatures of plugins without YAML files.
 
-`conf/GROUP/CHOICE.yaml` holds all settings of a choice with a comment each; its first comment says what the choice is.
-Only text is read here, so that listings and `--help` answer at once.
+`conf/GROUP/CHOICE.yaml` holds all settings of a choice, each with a comment; its first comment describes the choice.
+This module only reads text, so that listings and `--help` respond instantly.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from lp_framework.overrides import values_of
 
 KEY = re.compile(r"([\w@./-]+):( |$)")
 PACKAGE = re.compile(r"# @package (\S+)")
-# The keys of a config and the groups of which it chooses; those of an experiment have `override` before them.
+# The keys of a config and the groups in its defaults list; in an experiment these follow `override`.
 WORD = re.compile(r"^(?:  - |.*override /)?([\w/]+):", re.MULTILINE)
-# What every choice of a group begins with: the data module's settings for loading views.
+# Settings shared by all choices of a group: those of the data module for loading views.
 SHARED = {"data": {"/loader@_here_": "pairs"}}
 
 
@@ -36,24 +36,24 @@ class ConfigFile:
 
 
 def conf_folders(config_dir: str | None = None) -> list[Path]:
-    """The folders of configs, in the order in which a file is looked up."""
+    """The config folders, in lookup order."""
     return [*([Path(config_dir)] if config_dir else []), registry.conf_dir(), *registry.conf_folders()]
 
 
 def find(path: str, config_dir: str | None = None) -> Path | None:
-    """The file of `GROUP/CHOICE` or `COMMAND`."""
+    """Find the file of `GROUP/CHOICE` or `COMMAND`."""
     files = (folder / f"{path}.yaml" for folder in conf_folders(config_dir))
     return next((file for file in files if file.is_file()), None)
 
 
 def choices(group: str, config_dir: str | None = None) -> list[str]:
-    """What can be chosen by `group=CHOICE`, sorted."""
+    """The valid values of `group=CHOICE`, sorted."""
     files = {file.stem for folder in conf_folders(config_dir) for file in (folder / group).glob("*.yaml")}
     return sorted({*files, *(name for found, name in registry.plugin_classes() if found == group)})
 
 
 def origin(group: str, choice: str) -> str:
-    """Where a choice comes from: "built-in", or the plugin that brings it."""
+    """Where a choice comes from: "built-in", or the plugin that provides it."""
     for folder, where in {registry.conf_dir(): registry.BUILT_IN, **registry.conf_folders()}.items():
         if (folder / group / f"{choice}.yaml").is_file():
             return where
@@ -61,13 +61,13 @@ def origin(group: str, choice: str) -> str:
 
 
 def plugin_folders(overrides: Iterable[str]) -> list[str]:
-    """The folders of `plugins=[FOLDER,...]` on a command line."""
+    """The folders given by `plugins=[FOLDER,...]` on a command line."""
     folders = (folder.strip(" '\"") for folder in values_of(overrides).get("plugins", "").strip("[]").split(","))
     return [folder for folder in folders if folder]
 
 
 def read(path: str, config_dir: str | None = None) -> ConfigFile:
-    """`GROUP/CHOICE` or `COMMAND` as text, with the settings of the files of the same group that it builds on."""
+    """Read `GROUP/CHOICE` or `COMMAND` as text, including settings inherited from files of the same group."""
     file = find(path, config_dir)
     own = parse(file.read_text(encoding="utf-8") if file else "")
     group, _, choice = path.rpartition("/")
@@ -92,7 +92,7 @@ def read(path: str, config_dir: str | None = None) -> ConfigFile:
 
 
 def parse(text: str) -> ConfigFile:
-    """A YAML file's text in parts."""
+    """Split the text of a YAML file into its parts."""
     parts = ConfigFile()
     comments: list[str] = []
     block: list[str] | None = None
@@ -112,13 +112,13 @@ def parse(text: str) -> ConfigFile:
 
 
 def plugin_defaults(cls: type) -> dict[str, Any]:
-    """The settings of a constructor, each with its default, or with the mark of what has to be given."""
+    """The settings of a constructor, each with its default or the marker of a required value."""
     settings, _ = registry.parameters(cls)
     return {key: registry.MISSING if each.default is each.empty else each.default for key, each in settings.items()}
 
 
 def experiments(command: str, config_dir: str | None = None) -> list[str]:
-    """The experiments that choose and set nothing that only other commands have."""
+    """The experiments for a command: those without choices or settings that only other commands have."""
     folders = conf_folders(config_dir)
     words = {file.stem: _words(file) for folder in folders for file in folder.glob("*.yaml")}
     others = {word for each in words.values() for word in each} - words[command] - words["base"] - {"experiment"}
@@ -131,7 +131,7 @@ def _words(file: Path) -> set[str]:
 
 
 def values(group: str, choice: str) -> dict[str, Any]:
-    """The settings of a choice, presets included, by name."""
+    """The settings of a choice or preset, by name."""
     from omegaconf import OmegaConf
 
     known = choices(group)
@@ -143,7 +143,7 @@ def values(group: str, choice: str) -> dict[str, Any]:
 
 
 def command_help(command: str, overrides: Sequence[str], config_dir: str | None = None) -> str:
-    """What a command is for, what can be chosen, and each setting with the comment from its YAML file."""
+    """The help of a command: its purpose, its choices, and each setting with the comment from its YAML file."""
     config = read(command, config_dir)
     given = values_of(overrides)
     entries = [entry for entry in config.defaults if isinstance(entry, dict)]

@@ -1,6 +1,6 @@
 """The command line: `python -m lp_framework COMMAND [overrides]`, also installed as `lp`.
 
-Nothing heavy is imported before a command is known, so that the overview comes at once.
+Heavy imports wait until the command is known, so that the overview appears instantly.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ EXAMPLES = {
 def main() -> int:
     """Run the command of `sys.argv`.
 
-    Returns the exit status: 0, 1 for bad input, 2 for a command line that makes no sense, 130 after Ctrl-C, and 143
-    after SIGTERM, by which `kill` and schedulers of clusters end a command; it is stopped as by Ctrl-C.
+    Returns the exit status: 0 for success, 1 for bad input, 2 for an invalid command line, 130 after Ctrl-C, and 143
+    after SIGTERM, which `kill` and cluster schedulers send; it is handled like Ctrl-C.
     """
     stopped_by = signal.SIGINT
 
@@ -53,7 +53,7 @@ def main() -> int:
 
     signal.signal(signal.SIGTERM, terminate)
     command, *arguments = sys.argv[1:] or ["--help"]
-    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"  # the user asks for tracebacks
+    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"  # the user wants tracebacks
     try:
         if command in ("--help", "-h"):
             _print_overview()
@@ -73,7 +73,7 @@ def main() -> int:
     except KeyboardInterrupt as stop:
         print(str(stop) or "interrupted", file=sys.stderr)
         return 128 + stopped_by
-    except BrokenPipeError:  # the reader of a pipe, such as head, has gone
+    except BrokenPipeError:  # the reader of the pipe, such as head, has exited
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except UserError as error:

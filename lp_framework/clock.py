@@ -1,4 +1,4 @@
-"""Seconds that count what a GPU still has to do."""
+"""Wall-clock time that includes pending GPU work."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 
 def now(device: torch.device) -> float:
-    """A clock's seconds, once a GPU has done all that it was told."""
+    """Wall-clock seconds, after synchronizing with the GPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()

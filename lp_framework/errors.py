@@ -1,4 +1,4 @@
-"""The one exception for a user's mistake: the command line prints its sentence and no traceback."""
+"""The exception for user mistakes: the command line prints its message without a traceback."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from types import ModuleType
 
 
 class UserError(ValueError):
-    """Bad input, told in one sentence: what is wrong, where it is, what would be right."""
+    """Bad input, explained in one sentence: what is wrong, where it is, and what would be right."""
 
     status = 1  # the exit status of a command
 
 
 def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
-    """`"; did you mean 'x'?"` for the known name closest to `name`, or an empty string when none is close.
+    """`"; did you mean 'x'?"` for the known name closest to `name`, or an empty string if none is close.
 
-    `cutoff` is the least ratio of `difflib.SequenceMatcher` that counts as close, 1 for equal names.
+    `cutoff` is the minimum ratio of `difflib.SequenceMatcher`; equal names have ratio 1.
 
     >>> nearest("scor", ["score", "energy"])
     "; did you mean 'score'?"
@@ -27,7 +27,7 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
 
 
 def among(name: str, known: Iterable[str]) -> str:
-    """What to add to the sentence that `name` is not known: the closest of the known names, and all of them.
+    """Suffix for an error about an unknown `name`: the closest known name, and a list of all of them.
 
     >>> among("scor", ["score", "energy"])
     "; did you mean 'score'? (known: score, energy)"
@@ -37,13 +37,13 @@ def among(name: str, known: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """An error's message in one line, without the lines that OmegaConf and Hydra add for themselves."""
+    """An error's message in one line, without the extra lines added by OmegaConf and Hydra."""
     lines = [line.strip() for line in str(error).splitlines()]
     return " ".join(line for line in lines if line and not line.startswith(("full_key:", "object_type=", "See https:")))
 
 
 def check_settings(group: str, *settings: tuple[str, object, bool, str]) -> None:
-    """`UserError` for the first of a group's settings (name, value, whether it fits, what is wanted) that does not fit.
+    """Raise `UserError` for the first invalid one of a group's settings (name, value, is valid, what is required).
 
     >>> check_settings("solver", ("steps", 0, False, "at least 1"))
     Traceback (most recent call last):
@@ -55,7 +55,7 @@ def check_settings(group: str, *settings: tuple[str, object, bool, str]) -> None
 
 
 def at_least(least: float, group: str, **settings: float) -> None:
-    """`UserError` for the first of a group's settings that is below `least`, or not a number.
+    """Raise `UserError` for the first of a group's settings that is below `least` or NaN.
 
     >>> at_least(1, "solver", steps=0)
     Traceback (most recent call last):
@@ -65,12 +65,12 @@ def at_least(least: float, group: str, **settings: float) -> None:
 
 
 def positive(group: str, **settings: float) -> None:
-    """`UserError` for the first of a group's settings that is not above 0."""
+    """Raise `UserError` for the first of a group's settings that is not positive."""
     check_settings(group, *((name, value, value > 0, "positive") for name, value in settings.items()))
 
 
 def optional_import(module: str, user: str, install: str) -> ModuleType:
-    """A module of an optional package; without it a `UserError` that names its `user` and says how to `install` it."""
+    """Import an optional package for `user`; raises `UserError` with `install` instructions if it is missing."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""A command as a Hydra application, and what goes wrong in it explained in one sentence."""
+"""Run a command as a Hydra application and explain its errors in one sentence."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lp_framework.run_folders import HYDRA, Held, held, relative, remove_if_empt
 
 log = logging.getLogger(__name__)
 
-# Hydra's options, the latter with the values that they take.
+# Hydra's options; `OPTIONS` with their valid values.
 FLAGS = ("--help -h", "--hydra-help", "--resolve", "--multirun -m")
 OPTIONS = {
     **dict.fromkeys(("--config-dir -cd", "--config-name -cn", "--package -p")),
@@ -37,31 +37,31 @@ OPTIONS = {
     "--info -i": ["all", "config", "defaults", "defaults-tree", "plugins", "searchpath"],
 }
 
-# Beginnings of warnings, mostly Lightning's, on which a user of a command cannot or need not act.
+# Start of warnings, mostly Lightning's, that users of a command cannot or need not act on.
 OF_NO_USE = (
-    r"The '\w+' does not have many workers",  # batches come from memory, in this process
-    r"Detected pickle protocol \d+ in the checkpoint",  # it is refused with a sentence of ours
+    r"The '\w+' does not have many workers",  # batches are loaded from memory, in this process
+    r"Detected pickle protocol \d+ in the checkpoint",  # refused with our own message
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
     r"The number of training batches .* is smaller than the logging interval",
     r"Found \d+ module\(s\) in eval mode at the start of training",  # a frozen trunk
     r"Checkpoint directory .* exists and is not empty",
-    r"Total length of `DataLoader` across ranks is zero",  # an evaluation of which only the tables were missing
+    r"Total length of `DataLoader` across ranks is zero",  # a resumed evaluation that only lacks its tables
 )
 
-SLIP = 0.9  # from which ratio of likeness a name is a known one, misspelt: max_epoch, but not min_epochs
+SLIP = 0.9  # similarity ratio above which a name is a misspelt known one: max_epoch, but not min_epochs
 
 
 class UsageError(UserError):
-    """A command line that makes no sense."""
+    """An invalid command line."""
 
     status = 2
 
 
 def run(command: str, arguments: Sequence[str]) -> None:
-    """Compose `conf/COMMAND.yaml` with the arguments, and call `lp_framework.commands.COMMAND.run(config)` with it.
+    """Compose `conf/COMMAND.yaml` with the arguments and pass the config to `lp_framework.commands.COMMAND.run`.
 
-    Raises `UsageError` for arguments that do not compose, `UserError` for bad input met while running; in a sweep the
-    other jobs go on first.
+    Raises `UsageError` for arguments that cannot be composed, and `UserError` for bad input found at run time; in a
+    sweep the other jobs run first.
     """
     overrides, options = _parse(arguments)
     overrides = _with_trainer_arguments(with_paths_as_text(command, overrides))
@@ -77,12 +77,12 @@ def run(command: str, arguments: Sequence[str]) -> None:
         told = options["cfg"] or options["info"] or "hydra.mode" in given
         options["multirun"] |= _is_sweep(command, given["experiment"]) and not told
     if "resume" in given and (Path(given["resume"].strip("'\"")) / HYDRA).is_dir():
-        # A run goes on in its own folder with its log; Hydra's record there stays as it is.
+        # Resume in the run's own folder with its log; leave Hydra's record there unchanged.
         overrides += ["hydra.run.dir=${resume}", "hydra.output_subdir=null"]
     failed: list[UserError] = []
     with _restored():
         sys.argv = [sys.argv[0], *overrides, *_as_words(options)]
-        os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions are passed on instead of printed
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # raise exceptions instead of printing them
         task = _task(command, _as_words({key: options[key] for key in ("config_dir", "config_name")}), failed)
         try:
             hydra.main(version_base="1.3", config_path=str(registry.conf_dir()), config_name=command)(task)()
@@ -97,20 +97,20 @@ def run(command: str, arguments: Sequence[str]) -> None:
 
 
 def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Callable[[DictConfig], None]:
-    """What Hydra calls with the composed config of each job."""
+    """The function that Hydra calls with the composed config of each job."""
 
     def task(config: DictConfig) -> None:
         job = HydraConfig.get()
         sweep = job.mode == RunMode.MULTIRUN
         folder = Path(job.runtime.output_dir)
         registry.discover(catalogue.plugin_folders(job.overrides.task))
-        with _restored():  # the next job would take what Lightning leaves of this one's processes for its own
-            # The command line that starts this job alone: Lightning runs it for its other processes.
+        with _restored():  # otherwise the next job would reuse Lightning's environment variables from this one
+            # The command line of this job alone, which Lightning runs to start its other processes.
             own = [override for override in job.overrides.hydra if not override.startswith("hydra.mode=")]
             own += ["hydra.mode=RUN"] if sweep else []  # an experiment may ask for a sweep
             sys.argv = [sys.argv[0], command, *options, *own, *job.overrides.task]
             try:
-                _check_paths(config)  # before what computes is imported, which takes seconds
+                _check_paths(config)  # before the heavy imports, which take seconds
                 module = importlib.import_module(f"lp_framework.commands.{command}")
                 with _orderly_console(), held(relative(Path(config.get("resume") or folder))):
                     module.run(config)
@@ -124,14 +124,14 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
                 if sweep:
                     log.error("job %s (%s): %s", job.job.num, ", ".join(job.overrides.task), mistake)
                     raise mistake from error
-                log.info("stopped: %s", mistake)  # for the log; the console gets it from the caller
+                log.info("stopped: %s", mistake)  # for the log; the caller prints it
                 failed.append(mistake)
             except (KeyboardInterrupt, SystemExit):
                 remove_if_empty(folder, f"{job.job.name}.log")
                 raise
             except Exception as error:
                 log.log(logging.ERROR if sweep else logging.INFO, "%s failed", command, exc_info=True)
-                error.raised_by_a_command = True  # type: ignore[attr-defined]  # also after a launcher has pickled it
+                error.raised_by_a_command = True  # type: ignore[attr-defined]  # survives pickling by a launcher
                 raise
             finally:
                 _leave_processes()
@@ -141,7 +141,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
 
 
 def _check_paths(config: DictConfig) -> None:
-    """`UserError` for a value that is missing, and for a file or folder to be read that is not there."""
+    """Raise `UserError` for missing values, and for input files or folders that do not exist."""
     for key in sorted(OmegaConf.missing_keys(config)):
         raise UserError(f"{key} needs a value: give {key}=VALUE")
     for key in ("images", "image", "masks", "resume", "runs"):
@@ -157,15 +157,15 @@ def _check_paths(config: DictConfig) -> None:
         hint = f"; to train it: lp {train[0]}" if train else ""
         raise UserError(f"checkpoint={checkpoint}: there is no such file or folder{hint}")
     path = OmegaConf.select(config, "data.path")
-    photographs = config.get("image") or config.get("images")  # instead of the data
+    photographs = config.get("image") or config.get("images")  # used instead of the data
     if not photographs and path is not None and not Path(path).exists():
         (line, *_) = catalogue.read(f"data/{config.data.name}").settings.get("path", [""])
-        if registry.MISSING in line:  # other folders are made
+        if registry.MISSING in line:  # other folders are created if missing
             raise UserError(f"data.path={path}: there is no such file or folder")
 
 
 def _leave_processes() -> None:
-    """Leave the process group of a job with several processes: its threads would block the end of this one."""
+    """Leave the process group of a multi-process job, whose threads would prevent this process from exiting."""
     distributed = sys.modules.get("torch.distributed")
     if distributed is not None and distributed.is_available() and distributed.is_initialized():
         distributed.destroy_process_group()
@@ -173,7 +173,7 @@ def _leave_processes() -> None:
 
 @contextmanager
 def _restored() -> Iterator[None]:
-    """The command line and the environment as they were, afterwards."""
+    """Restore the command line and the environment afterwards."""
     argv, environment = sys.argv, dict(os.environ)
     try:
         yield
@@ -186,13 +186,13 @@ def _restored() -> Iterator[None]:
 
 @contextmanager
 def _orderly_console() -> Iterator[None]:
-    """Lightning's notes go to the run's log alone; warnings go to the log and, one line each, to the console."""
+    """Send Lightning's messages only to the run's log, and warnings to the log and, one line each, to the console."""
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         notes = logging.getLogger(name)
-        notes.handlers.clear()  # Hydra's handlers, above it, take over
+        notes.handlers.clear()  # Hydra's root handlers take over
         notes.propagate = True
-    logging.getLogger("huggingface_hub").propagate = False  # it prints by itself, and would do so twice
-    logging.raiseExceptions = False  # a log on a full disk is cut short without a traceback a line
+    logging.getLogger("huggingface_hub").propagate = False  # it prints its own messages; avoid duplicates
+    logging.raiseExceptions = False  # on a full disk, drop log lines without printing tracebacks
     with warnings.catch_warnings():
         for beginning in OF_NO_USE:
             warnings.filterwarnings("ignore", beginning)
@@ -201,9 +201,9 @@ def _orderly_console() -> Iterator[None]:
 
 
 def _store_plugin_configs(config_dir: str | None) -> None:
-    """Give Hydra the choices of plugins, but for names of the user's own or the built-in configs, which come first.
+    """Register the choices of plugins with Hydra, unless a user's own or a built-in config of that name exists.
 
-    A plugin's file is stored as it is; where a class is named by a file or has none, all of its settings are.
+    A plugin's file is stored unchanged; for a class without a file, or named by one, all of its settings are stored.
     """
     classes, folders = registry.plugin_classes(), registry.conf_folders()
     choices = dict.fromkeys(classes)
@@ -230,7 +230,7 @@ def _store_plugin_configs(config_dir: str | None) -> None:
 
 
 def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    """The overrides and Hydra's options, in any order; `UsageError` for an option that does not exist."""
+    """Split arguments, in any order, into overrides and Hydra's options; `UsageError` for an unknown option."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for option in FLAGS:
         parser.add_argument(*option.split(), action="store_true")
@@ -248,7 +248,7 @@ def _parse(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
 
 
 def _with_trainer_arguments(overrides: Sequence[str]) -> list[str]:
-    """Arguments of Lightning's Trainer that the YAML files leave out are added, unless they are but a letter off."""
+    """Add `+` to arguments of Lightning's Trainer that the YAML files lack, unless they look like misspellings."""
     files = [catalogue.read(f"trainer/{choice}") for choice in catalogue.choices("trainer")]
     known = {key for file in files for key in file.settings}
 
@@ -260,13 +260,13 @@ def _with_trainer_arguments(overrides: Sequence[str]) -> list[str]:
 
 
 def _as_words(options: Mapping[str, Any]) -> list[str]:
-    """Options as words of a command line."""
+    """Convert options to command-line arguments."""
     given = {f"--{name.replace('_', '-')}": value for name, value in options.items() if value}
     return [word for name, value in given.items() for word in ([name] if value is True else [name, value])]
 
 
 def _is_sweep(command: str, experiment: str) -> bool:
-    """Whether an experiment is a sweep; `UsageError` for one that belongs to other commands."""
+    """Whether an experiment is a sweep; `UsageError` if it belongs to another command."""
     own = catalogue.experiments(command)
     if experiment not in own and catalogue.find(f"experiment/{experiment}"):
         told = f"experiment={experiment} belongs to another command, not to {command}"
@@ -275,12 +275,12 @@ def _is_sweep(command: str, experiment: str) -> bool:
 
 
 def explain(error: Exception) -> str:
-    """What to tell a user of an error that Hydra or OmegaConf raised."""
+    """Turn an error raised by Hydra or OmegaConf into a message for the user."""
     cause = error.__cause__ or error.__context__
     match error:
         case MissingConfigException(missing_cfg_file=str(file)) if "/" in file:
             group, _, choice = file.rpartition("/")
-            known = error.options or catalogue.choices(group)  # Hydra has none of what a file asks for
+            known = error.options or catalogue.choices(group)  # Hydra lists no options for choices made in a file
             told = f"{group}={choice}: there is no {group} '{choice}'{among(choice, known)}"
             if group == "hydra/launcher":
                 return f"{told}; pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]' brings some"
@@ -304,7 +304,7 @@ def explain(error: Exception) -> str:
 
 
 def _place(error: Exception) -> str:
-    """`"In 'experiment/paper': "` where Hydra says that an error is in a file."""
+    """`"In 'experiment/paper': "` if Hydra reports that an error is in a file."""
     place, colon, _ = str(error).partition(": ")
     return place + colon if place.startswith("In '") else ""
 

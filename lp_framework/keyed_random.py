@@ -1,8 +1,8 @@
-"""Random draws keyed by what they belong to (seed, pair, start, step), not by when they are drawn.
+"""Random draws keyed by what they belong to (seed, pair, start, step), not by the order in which they are drawn.
 
-A counter-based generator: the value at a key is a hash of the key. So any batching, order, number of processes
-or resumption gives the same draws. All are made on the CPU, so that they are the same for every device, and none needs
-float64 there; keys may be anywhere, but to fetch them waits for their device.
+A counter-based generator: the value at a key is a hash of the key. Draws are therefore independent of batching, order,
+number of processes and resumption. They are made on the CPU so that they are equal for all devices and no device needs
+float64. Keys may be on any device, but fetching them synchronizes with it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def stable_id(text: str) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
-# Unsigned 64-bit constants, as the int64 with the same bits.
+# Unsigned 64-bit constants as int64 with the same bits.
 _GOLDEN, _MIX_1, _MIX_2 = (c - (1 << 64) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
@@ -36,12 +36,12 @@ def _mix(bits: Tensor) -> Tensor:
 
 
 def on_cpu(keys: Tensor) -> Tensor:
-    """Keys where draws are made; on the meta device they have no values, and are 0."""
+    """Move keys to the CPU; keys on the meta device have no values and become 0."""
     return torch.zeros(keys.shape, dtype=keys.dtype) if keys.is_meta else keys.cpu()
 
 
 def to_device(draws: Tensor, device: torch.device) -> Tensor:
-    """Draws on a device, without waiting for what it has to do, where it can be trusted with that (Apple's cannot)."""
+    """Move draws to a device, asynchronously where that is reliable (not on Apple's)."""
     return draws.to(device, non_blocking=device.type not in ("cpu", "mps"))
 
 
@@ -59,7 +59,7 @@ def keyed_uniform(*keys: Tensor | int, count: int) -> Tensor:
     >>> keyed_uniform(0, torch.tensor([7, 7, 8]), count=2)[:, 0].diff().tolist()[0]
     0.0
     """
-    # 52 bits: with 53 the half is rounded away, and the largest draw is 1 itself.
+    # 52 bits: with 53 the half would be rounded away, and the largest draw would be 1.
     return (_shift(keyed_bits(*keys, count=count), 12).double() + 0.5) * 2.0**-52
 
 

@@ -1,7 +1,7 @@
-"""Paths on the command line as people type them, written so that Hydra reads them as text and as nothing else.
+"""Quoting of paths on the command line, so that Hydra reads them as plain text.
 
-Hydra's grammar takes a folder called 20240101 for a number, and stops at the brackets, quotes and letters outside ASCII
-that file names have. Values of settings that hold paths are therefore put in quotes where they need them.
+Hydra's grammar parses a folder called 20240101 as a number, and fails on brackets, quotes and non-ASCII letters in file
+names. Values of settings that hold paths are therefore quoted where necessary.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from collections.abc import Iterable, Sequence
 
 from lp_framework.errors import UserError
 
-# Settings that hold a path, or a list of paths or of names.
+# Settings that hold a path, or a list of paths or names.
 PATHS = re.compile(
     r"(images?|masks|checkpoint|resume|path|output|runs|plugins|data\.views|hydra\.(run|sweep)\.dir"
     r"|data\.objects(?==\[)|[^=]+\.(path|labels|renderings|cache))="
 )
-PLAIN = re.compile(r"[\w./:@%+*?|-]+", re.ASCII)  # text to Hydra, unless it is one of the following
+PLAIN = re.compile(r"[\w./:@%+*?|-]+", re.ASCII)  # plain text for Hydra, unless it matches the following
 OTHER_THAN_TEXT = re.compile(r"[-+]?[\d_]*\.?[\d_]+(e[-+]?\d+)?|[-+]?(inf|nan)|true|false", re.IGNORECASE)
-# What Hydra is to read itself: nothing, a quoted text, a function, an interpolation.
+# Values to leave to Hydra: empty, quoted text, a function, an interpolation.
 HYDRAS_OWN = re.compile(r"null|\?\?\?|['\"].*|(choice|range|glob|interval|sort|shuffle|str)\(.*\)|.*\$\{.*", re.DOTALL)
-PLAIN_ARGUMENTS = {"estimate": "images"}  # the setting that arguments without a key give
+PLAIN_ARGUMENTS = {"estimate": "images"}  # the setting for arguments without a key
 
 
 def with_paths_as_text(command: str, overrides: Sequence[str]) -> list[str]:
-    """The overrides with paths in quotes where Hydra needs them, and arguments without a key as a setting.
+    """Quote the paths in overrides where Hydra needs it, and turn arguments without a key into a setting.
 
     `lp estimate "IMG (1).png" b.png` becomes `images=['IMG (1).png',b.png]`.
     """
@@ -39,7 +39,7 @@ def with_paths_as_text(command: str, overrides: Sequence[str]) -> list[str]:
 
 
 def values_of(overrides: Iterable[str]) -> dict[str, str]:
-    """What a command line sets each key to, as text; the last value counts.
+    """The value, as text, that a command line sets each key to; the last one counts.
 
     >>> values_of(["seed=1", "+solver.gamma=0.3", "~start", "seed=2"])
     {'seed': '2', 'solver.gamma': '0.3'}
@@ -53,14 +53,14 @@ def _as_text(override: str) -> str:
         return override
     inside = value[1:-1] if value[:1] == "[" and value[-1:] == "]" else value
     if any(quote in inside for quote in "'\"") and "," in inside:
-        return override  # whoever quotes one of several knows how
+        return override  # a user who quotes one of several knows Hydra's rules
     parts = ",".join(_quoted(part.strip()) for part in inside.split(","))
     as_list = inside is not value or (key == "plugins" and value)
     return f"{key}=[{parts}]" if as_list else f"{key}={parts}"
 
 
 def _quoted(path: str) -> str:
-    """A path as Hydra reads it as text; `~` at its beginning is the home folder."""
+    """Quote a path so that Hydra reads it as text; expands a leading `~` to the home folder."""
     path = os.path.expanduser(path)
     if not path or HYDRAS_OWN.fullmatch(path):
         return path

@@ -1,17 +1,17 @@
-"""Names to classes: `@register("solver", "langevin")` makes a class choosable as `solver=langevin`.
+"""Registry of classes by name: `@register("solver", "langevin")` makes a class available as `solver=langevin`.
 
-The typed arguments of a class's constructor are its settings. An argument that bears the name of a group (`prior`,
-`model`, `backbone`, ...) is a *component*: an object of that group that the caller builds and passes, never a setting.
+The typed arguments of a class's constructor are its settings. An argument named after a group (`prior`, `model`,
+`backbone`, ...) is a *component*: an object of that group that the caller builds and passes, never a setting.
 
-Built-in classes are in the packages of `GROUPS`, imported when a class of the group is asked for; others are in
+Built-in classes are in the packages of `GROUPS`, which are imported on first use of the group. Plugins are
 
 - *packages* with an entry point in the group `lp_framework.plugins`, whose value is a module to import;
-- *folders*: `plugins/` of the working directory and those given to `discover`. A folder that holds Python files or a
-  pyproject.toml is one plugin; any other folder is searched for plugins one level down.
+- *folders*: `plugins/` of the working directory and those passed to `discover`. A folder that contains Python files or
+  a pyproject.toml is one plugin; any other folder is searched for plugins one level down.
 
 A plugin's modules are imported under their own names, with its folder at the end of `sys.path`, so that worker
-processes can unpickle its classes. A `conf/` folder beside a module of a plugin (inside it, if it is a package) holds
-choices of its own.
+processes can unpickle its classes. A `conf/` folder beside a module of a plugin (inside it, if it is a package) adds
+config choices.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from typing import Any, TypeVar
 
 from lp_framework.errors import UserError, among, nearest
 
-GROUPS = {  # each with the packages whose import registers its built-in classes
+GROUPS = {  # each with the packages that register its built-in classes on import
     "model": ("lp_framework.models", "lp_framework.priors"),  # a prior is trained as a model
     "backbone": ("lp_framework.models",),
     "prior": ("lp_framework.priors",),
@@ -44,7 +44,7 @@ GROUPS = {  # each with the packages whose import registers its built-in classes
 PACKAGE = "lp_framework"
 BUILT_IN = "built-in"
 ENTRY_POINTS = "lp_framework.plugins"
-MISSING = "???"  # OmegaConf's mark of a value that has to be given
+MISSING = "???"  # OmegaConf's marker of a required value
 
 Key = tuple[str, str]  # group, name
 _Class = TypeVar("_Class", bound=type)
@@ -55,7 +55,7 @@ class _State:
     classes: dict[Key, tuple[type, str]] = field(default_factory=dict)  # with their origins
     conf_folders: dict[Path, str] = field(default_factory=dict)  # with their origins
     failures: dict[str, str] = field(default_factory=dict)  # by origin
-    seen: set[str | Path] = field(default_factory=set)  # where has been looked already
+    seen: set[str | Path] = field(default_factory=set)  # places already searched
     loading: str | None = None  # origin of the plugin being imported
 
 
@@ -63,9 +63,9 @@ _state = _State()
 
 
 def register(group: str, name: str) -> Callable[[_Class], _Class]:
-    """Class decorator: make the class choosable as `group=name`.
+    """Class decorator that makes a class available as `group=name`.
 
-    Raises `UserError` for an unknown group, and for a name that another class of the group already has.
+    Raises `UserError` for an unknown group, and for a name already used by another class of the group.
     """
     if group not in GROUPS:
         raise UserError(f"there is no group '{group}'{among(group, GROUPS)}")
@@ -88,7 +88,7 @@ def register(group: str, name: str) -> Callable[[_Class], _Class]:
 
 
 def conf_dir() -> Path:
-    """The folder of the built-in configs: inside the package when installed, else beside it in the source tree."""
+    """The folder of the built-in configs: inside the installed package, or beside it in the source tree."""
     inside = Path(__file__).parent / "conf"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "conf"
 
@@ -106,7 +106,7 @@ def names(group: str) -> list[str]:
 
 
 def get(group: str, name: str) -> type:
-    """The class registered as `group=name`; `UserError` with the known names where there is none."""
+    """The class registered as `group=name`; `UserError` with the known names if there is none."""
     known = names(group)
     if name not in known:
         raise UserError(f"there is no {group} '{name}'{among(name, known)}")
@@ -114,29 +114,29 @@ def get(group: str, name: str) -> type:
 
 
 def plugin_classes() -> dict[Key, tuple[type, str]]:
-    """The classes that plugins have registered, by group and name, each with its origin."""
+    """The classes registered by plugins, by group and name, each with its origin."""
     discover()
     return {key: (cls, origin) for key, (cls, origin) in _state.classes.items() if origin != BUILT_IN}
 
 
 def failures() -> dict[str, str]:
-    """Plugins that could not be loaded: origin to error."""
+    """Plugins that failed to load: origin to error."""
     discover()
     return dict(_state.failures)
 
 
 def conf_folders() -> dict[Path, str]:
-    """The `conf/` folders that plugins bring, each with its origin, in the order in which the plugins were found."""
+    """The `conf/` folders of plugins, each with its origin, in order of discovery."""
     discover()
     return dict(_state.conf_folders)
 
 
 def build(group: str, settings: Mapping[str, Any] | str, **components: object) -> Any:
-    """An instance of the class that `settings` names: `{"name": ..., setting: value, ...}`, or the name alone.
+    """Build an instance from `settings`: `{"name": ..., setting: value, ...}`, or just the name.
 
     `components` are the available objects by group (`model=network, prior=prior`); the constructor gets those that it
-    declares. Raises `UserError` for an unknown name or setting, a setting without a value, a value that does not fit
-    its type, and a component that is needed and missing; what the constructor raises passes through.
+    declares. Raises `UserError` for an unknown name or setting, a setting without a value, a value of the wrong type,
+    and a missing required component; exceptions raised by the constructor propagate.
     """
     values = {"name": settings} if isinstance(settings, str) else dict(settings)
     name = values.pop("name", None)
@@ -158,7 +158,7 @@ def build(group: str, settings: Mapping[str, Any] | str, **components: object) -
 
 
 def component_names(cls: type) -> list[str]:
-    """The components that a class's constructor declares, that is its arguments named after a group."""
+    """The components of a class's constructor, that is, its arguments named after a group."""
     return list(parameters(cls)[1])
 
 
@@ -171,23 +171,23 @@ def parameters(cls: type) -> tuple[dict[str, inspect.Parameter], dict[str, inspe
 
 
 def checked(function: Callable[..., Any], values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """The values as the function's type hints want them: a whole number for a float becomes one, a list a tuple.
+    """Convert the values to the function's type hints, for example an int to a float or a list to a tuple.
 
-    Raises `UserError` for a value that does not fit the hint of the argument of its name. Objects other than names and
-    numbers are passed on as they are.
+    Raises `UserError` for a value that does not match the type hint of its argument. Objects other than names and
+    numbers are passed through unchanged.
     """
     from pydantic import TypeAdapter, ValidationError
     from pydantic.errors import PydanticUserError
 
     try:
         hints = typing.get_type_hints(function)
-    except NameError:  # names that only a type checker imports
+    except NameError:  # names imported only for type checking
         return dict(values)
     found = dict(values)
     for key, value in values.items():
         hint = hints.get(key, Any)
         try:
-            # As JSON, in which a list fits a tuple and text fits a path; strictly, so that text never fits a number.
+            # Validate as JSON, where a list matches a tuple and text a path; strictly, so that text is never a number.
             found[key] = TypeAdapter(hint).validate_json(json.dumps(value), strict=True)
         except (TypeError, PydanticUserError):
             continue
@@ -202,11 +202,11 @@ def checked(function: Callable[..., Any], values: Mapping[str, Any], prefix: str
 
 
 def discover(folders: Iterable[str | Path] = ()) -> None:
-    """Load the plugins: entry points, `plugins/` of the working directory, and `folders`; each of them once.
+    """Load all plugins, each once: entry points, `plugins/` of the working directory, and `folders`.
 
-    Raises `UserError` for one of the `folders` that does not exist or holds no plugin.
+    Raises `UserError` if one of the `folders` does not exist or contains no plugin.
     """
-    if _state.loading is not None:  # a plugin that asks for names while it is being imported
+    if _state.loading is not None:  # called by a plugin during its own import
         return
     if ENTRY_POINTS not in _state.seen:
         _state.seen.add(ENTRY_POINTS)
@@ -226,7 +226,7 @@ def discover(folders: Iterable[str | Path] = ()) -> None:
 
 
 def _plugins(folder: Path) -> list[Path]:
-    """The folder itself where it is a plugin, otherwise the plugins one level down."""
+    """The folder itself if it is a plugin, otherwise the plugins one level down."""
 
     def is_plugin(place: Path) -> bool:
         return place.is_dir() and ((place / "pyproject.toml").exists() or any(place.glob("*.py")))
@@ -235,7 +235,7 @@ def _plugins(folder: Path) -> list[Path]:
 
 
 def _load_plugin(folder: Path) -> None:
-    """Import the modules and packages of a plugin's folder; of a folder that is a package, only that package."""
+    """Import the modules and packages in a plugin's folder, or only the package if the folder itself is one."""
     place = folder.resolve()
     if place in _state.seen:
         return
@@ -256,7 +256,7 @@ def _load_plugin(folder: Path) -> None:
 
 
 def _import(name: str, wanted: Path | None = None) -> None:
-    """Import a module, which has to be that of the file `wanted`, and note the `conf/` folder beside it."""
+    """Import a module, check that it is the file `wanted`, and record the `conf/` folder beside it."""
     file = getattr(importlib.import_module(name), "__file__", None)
     if wanted is not None and (file is None or Path(file).resolve() != wanted):
         raise ImportError(f"the name of its module '{name}' is already used by {file or 'another'}")
@@ -266,7 +266,7 @@ def _import(name: str, wanted: Path | None = None) -> None:
 
 @contextmanager
 def _guarded(origin: str) -> Iterator[None]:
-    """Import a plugin: what it registers gets `origin`; when it fails, nothing of it stays but the error."""
+    """Import a plugin: its classes get `origin`; if it fails, everything is rolled back and only the error is kept."""
     _state.loading, before = origin, (dict(_state.classes), dict(_state.conf_folders))
     try:
         yield

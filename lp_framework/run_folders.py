@@ -1,4 +1,4 @@
-"""The folder of a run: one command at a time works in it, and none is left behind with nothing in it."""
+"""Run folders: only one command at a time may use a folder, and empty folders are removed."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ HYDRA, LOCK = ".hydra", ".lock"
 
 
 def relative(folder: Path) -> Path:
-    """A folder relative to the working directory where it lies below it."""
+    """A folder relative to the working directory if it lies inside it, otherwise unchanged."""
     return folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
 
 
 class Held(UserError):
-    """Another command works in this folder."""
+    """Another command is using this folder."""
 
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Have a run's folder to oneself until the end of the block, or of the process.
+    """Lock a run's folder until the end of the block or of the process.
 
-    `Held` where another process has it, `DiskFull` for want of room in the block. Of several processes of a run the
-    first holds the folder; one that does not exist is nobody's.
+    Raises `Held` if another process holds it, and `DiskFull` if the disk fills up inside the block. Of several
+    processes of a run, rank 0 holds the folder; a folder that does not exist is not locked.
     """
-    from lightning.pytorch.utilities import rank_zero_only  # a command has loaded it by now
+    from lightning.pytorch.utilities import rank_zero_only  # already imported by any command
 
     lock = FileLock(folder / LOCK)
     if rank_zero_only.rank == 0 and folder.is_dir():  # type: ignore[attr-defined]  # set at import
@@ -53,6 +53,6 @@ def held(folder: Path) -> Iterator[None]:
 
 
 def remove_if_empty(folder: Path, log: str) -> None:
-    """Remove a run's folder that has nothing but its `log`, the lock, and what Hydra puts into every one."""
+    """Remove a run's folder if it contains only its `log`, the lock and Hydra's own files."""
     if folder.is_dir() and {each.name for each in folder.iterdir()} <= {HYDRA, LOCK, log} and folder != Path.cwd():
         shutil.rmtree(folder, ignore_errors=True)

@@ -1,9 +1,9 @@
-"""Lets torchvision be imported where its compiled operators do not load.
+"""Makes torchvision importable when its compiled operators do not load.
 
-The extension of the package index's torchvision, compiled against a CUDA build, does not load with the CPU build of
-torch, and `import torchvision` then stops at "operator torchvision::nms does not exist". Networks and weights need no
-operator, so the names of the two that the import describes are declared; calling one still raises torchvision's error.
-Lightning imports torchvision by way of torchmetrics, so `install` sees to it whoever asks for torchvision first.
+The extension of torchvision on the package index is compiled against a CUDA build. With a CPU build of torch it does
+not load, and `import torchvision` fails with "operator torchvision::nms does not exist". Networks and weights need no
+operators, so this module declares the two that the import needs; calling one still raises torchvision's error.
+Lightning imports torchvision through torchmetrics, so `install` hooks into whichever import comes first.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _declared: list[Any] = []  # torch.library.Library: a declaration lasts as long 
 
 
 class _Watch:
-    """A finder that finds no module, but notices when torchvision is looked for."""
+    """An import finder that finds no module but detects imports of torchvision."""
 
     @classmethod
     def find_spec(cls, fullname: str, path: object, target: object = None) -> None:
@@ -27,15 +27,15 @@ class _Watch:
 
 
 def install() -> None:
-    """Have `ensure` called when torchvision is first imported; costs nothing until then."""
+    """Call `ensure` when torchvision is first imported; has no cost until then."""
     if "torchvision" not in sys.modules and _Watch not in sys.meta_path:
         sys.meta_path.insert(0, _Watch)
 
 
 def ensure() -> None:
-    """Call it before the first `import torchvision`; where torchvision is healthy it changes nothing."""
+    """Declare missing operators, before the first `import torchvision`; does nothing if its extension loads."""
     if _Watch in sys.meta_path:
-        sys.meta_path.remove(_Watch)  # else looking for torchvision would call this again from within
+        sys.meta_path.remove(_Watch)  # otherwise looking for torchvision would recurse
     package = None if "torchvision" in sys.modules or _declared else importlib.util.find_spec("torchvision")
     if package is None or package.origin is None:
         return
