@@ -3,9 +3,9 @@
 Convention: matrices act on column vectors; angles in radians; a twist `xi` `[..., 6]` holds the translation part
 first, then the rotation part (iFusion's order). `se3_exp(xi)` is the matrix exponential of
 `[[hat(xi[3:]), xi[:3]], [0, 0]]`, so the translation of the result is `V(omega) rho`, not `rho`.
-Batch dimensions are any and broadcast where there are two arguments. Exponentials have correct first and second
-derivatives, in reverse and forward mode, at and near zero too. Products are written out elementwise: a matrix product
-would lose digits under autocast or TF32.
+Batch dimensions are arbitrary and broadcast between two arguments. Exponentials have correct first and second
+derivatives in reverse and forward mode, also at and near zero. Products are written out elementwise because matrix
+products lose digits under autocast or TF32.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _CUBIC_SERIES = [(-1) ** k / math.factorial(2 * k + 3) for k in range(_TERMS)]  
 
 
 def _even_function(squared: Tensor, closed_form: Callable[[Tensor], Tensor], series: Sequence[float]) -> Tensor:
-    """An even function of t, given t^2: its power series where t^2 < 1, else `closed_form(t)`.
+    """An even function of t, given t^2: its power series where t^2 < 1, otherwise `closed_form(t)`.
 
-    Each branch sees harmless arguments where the other is taken, so that no NaN of the untaken one reaches a gradient.
-    `squared` needs a dimension: under vmap, forward-mode tangents of 0-dimensional float32 tensors that meet a Python
-    float come out in float64 (seen with PyTorch 2.13).
+    Each branch gets harmless arguments where the other is selected, so that its NaNs never reach a gradient. `squared`
+    needs at least one dimension: under vmap, forward-mode tangents of 0-dimensional float32 tensors combined with a
+    Python float become float64 (seen with PyTorch 2.13).
     """
     near = squared < 1
     inside = squared.masked_fill(~near, 0.0)
@@ -56,7 +56,7 @@ def hat(omega: Tensor) -> Tensor:
 
 
 def so3_exp(omega: Tensor) -> Tensor:
-    """Rotation matrix `[..., 3, 3]` of a rotation vector `[..., 3]` (axis times angle, radians), after Rodrigues.
+    """Rotation matrix `[..., 3, 3]` of a rotation vector `[..., 3]` (axis times angle, radians), by Rodrigues' formula.
 
     >>> so3_exp(torch.tensor([0.0, torch.pi / 6, 0.0]))
     tensor([[ 0.8660,  0.0000,  0.5000],
@@ -72,10 +72,10 @@ def so3_exp(omega: Tensor) -> Tensor:
 
 
 def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
-    """Angle `[...]` in radians, in [0, pi], of the rotation between two rotations `[..., 3, 3]`.
+    """Angle `[...]` in radians, in [0, pi], between two rotations `[..., 3, 3]`.
 
-    By atan2 of its sine and cosine, both taken from the difference of the matrices: exact zero for equal rotations and
-    no loss for tiny angles in float32. Its gradient is 0 at angle 0, where the angle has a kink.
+    Computed by atan2 of sine and cosine, both from the difference of the matrices: exactly zero for equal rotations,
+    and accurate for tiny angles in float32. The gradient is 0 at angle 0, where the angle is not differentiable.
 
     >>> geodesic_angle(torch.eye(3), so3_exp(torch.tensor([3e-6, 0.0, 4e-6])))
     tensor(5.0000e-06)
@@ -89,9 +89,9 @@ def geodesic_angle(first: Tensor, second: Tensor) -> Tensor:
 
 
 def is_rotation(matrix: Tensor, tolerance: float = 1e-3) -> Tensor:
-    """Whether matrices `[..., 3, 3]` are rotations, `[...]`: orthonormal to `tolerance`, of positive determinant.
+    """Whether matrices `[..., 3, 3]` are rotations, `[...]`: orthonormal to `tolerance`, with positive determinant.
 
-    False where an entry is not finite.
+    False if an entry is not finite.
 
     >>> is_rotation(torch.stack([torch.eye(3), -torch.eye(3), 2 * torch.eye(3)]))
     tensor([ True, False, False])

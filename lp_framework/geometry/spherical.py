@@ -1,9 +1,9 @@
-"""Spherical view poses, relative poses, the cameras that they stand for, and errors between cameras.
+"""Spherical view poses, relative poses, the corresponding cameras, and errors between cameras.
 
 Convention (the paper's appendix, Coordinate System): a view pose `[..., 3]` is (latitude, longitude, radius) in
 radians, radians, scene units. Latitude is up-positive from the equator; longitude 0 lies on +Z and grows towards +X
 (counter-clockwise seen from +Y); the camera looks at the origin, +Y is up. `camera_to_world` `[..., 4, 4]` is OpenGL
-style: the camera looks down its -Z, +Y up, +X right. Batch dimensions are any.
+style: the camera looks down its -Z, +Y up, +X right. Batch dimensions are arbitrary.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ def wrap_angle(angle: Tensor) -> Tensor:
     >>> wrap_angle(torch.tensor([3.5, -3.5, 0.25, torch.pi]))
     tensor([-2.7832,  2.7832,  0.2500, -3.1416])
     """
-    rest = torch.fmod(angle[..., None], 2 * math.pi)  # exact, in (-2 pi, 2 pi), and so are the two shifts
+    rest = torch.fmod(angle[..., None], 2 * math.pi)  # exact, in (-2 pi, 2 pi); the shifts below are exact too
     rest = torch.where(rest >= math.pi, rest - 2 * math.pi, rest)
     return torch.where(rest < -math.pi, rest + 2 * math.pi, rest).squeeze(-1)
 
 
 def _reduce(angle: Tensor, turn: float) -> Tensor:
-    """The same angle in [0, turn); `angle` needs a dimension (see `se3._even_function`)."""
+    """The same angle in [0, turn); `angle` needs at least one dimension (see `se3._even_function`)."""
     rest = torch.remainder(angle, turn)
-    # For a tiny negative angle `remainder` rounds to `turn` itself.
+    # For a tiny negative angle, `remainder` rounds to `turn` itself.
     return torch.where(rest >= turn, rest - turn, rest)
 
 
@@ -80,11 +80,11 @@ def camera_to_world(pose: Tensor) -> Tensor:
 
 
 def level_camera(pose: Tensor, direction: Tensor) -> Tensor:
-    """Camera `[..., 4, 4]` at a view pose `[..., 3]`, held level (its +X axis is horizontal), that sees the origin
-    along `direction` `[..., 3]`, a vector of any length in the camera's own axes with a negative third entry.
+    """Level camera `[..., 4, 4]` (horizontal +X axis) at a view pose `[..., 3]` that sees the origin along `direction`
+    `[..., 3]`, a vector of any length in the camera's own axes with a negative third entry.
 
-    It is `camera_to_world(pose)`, which sees the origin straight ahead, turned until the origin appears along
-    `direction`. Near a pole there may be no level camera; the result then has the least roll.
+    It is `camera_to_world(pose)`, which sees the origin straight ahead, rotated until the origin appears along
+    `direction`. Near a pole there may be no level camera; the result then has the smallest roll.
 
     >>> camera = level_camera(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, -1.0]))  # the origin at the right
     >>> camera[:, 2]  # so it looks to the left of it
@@ -93,7 +93,7 @@ def level_camera(pose: Tensor, direction: Tensor) -> Tensor:
     x, y, z = direction.unbind(-1)
     aside = torch.hypot(x, y)
     axis = torch.stack([-y, x, torch.zeros_like(x)], dim=-1) / aside.clamp(min=torch.finfo(x.dtype).tiny)[..., None]
-    turn = so3_exp(axis * torch.atan2(aside, -z)[..., None])  # the smallest that takes `direction` to straight ahead
+    turn = so3_exp(axis * torch.atan2(aside, -z)[..., None])  # the smallest rotation of `direction` to straight ahead
     right, up, back = turn[..., 0].unbind(-1)  # where it takes the +X axis, which is horizontal after this roll:
     sine = -pose[..., 0].tan() * back / torch.hypot(right, up)
     roll = torch.asin(sine.clamp(-1, 1)) - torch.atan2(up, right)
@@ -105,8 +105,8 @@ def level_camera(pose: Tensor, direction: Tensor) -> Tensor:
 def view_pose(camera: Tensor) -> Tensor:
     """View pose `[..., 3]` of the centre of a camera `[..., 4, 4]`; latitude in [-pi/2, pi/2], longitude in [0, 2 pi).
 
-    At the poles, to rounding, the centre does not tell the longitude; it is then that of the camera's right axis, which
-    keeps `view_pose(camera_to_world(pose)) == pose` there. Latitude and longitude have no derivative at the poles.
+    At the poles (up to rounding) the centre does not determine the longitude, so it comes from the camera's right axis,
+    which keeps `view_pose(camera_to_world(pose)) == pose`. Latitude and longitude are not differentiable at the poles.
 
     >>> view_pose(camera_to_world(torch.tensor([-0.3, 6.0, 1.5])))
     tensor([-0.3000,  6.0000,  1.5000])
@@ -142,9 +142,9 @@ def translation_error(predicted: Tensor, true: Tensor) -> Tensor:
 
 
 def spherical_residual(camera: Tensor) -> Tensor:
-    """How far a camera `[..., 4, 4]` is from spherical: angle `[...]` in degrees to the spherical one at its centre.
+    """Angle `[...]` in degrees between a camera `[..., 4, 4]` and the spherical camera at its centre.
 
-    The rotation error, against this camera, of a method that finds its centre exactly but predicts spherical cameras.
+    This is the rotation error of a method that finds the camera's centre exactly but predicts spherical cameras.
 
     >>> upright = rigid_transform(torch.eye(3), torch.tensor([1.0, 0.0, 1.0]))  # looks along -Z, past the origin
     >>> spherical_residual(upright)

@@ -1,8 +1,8 @@
-"""Two views of one object: cameras relative to each other, and what they say of the relative pose.
+"""Two views of one object: relative cameras, and the relative pose they imply.
 
 A *relative camera* `[..., 4, 4]` is the query's camera in the frame of the reference's camera, both with OpenGL axes
-(the camera looks down its -Z, +Y up, +X right). Methods that only see two images know the length of its translation up
-to a factor at best. Batch dimensions are any and broadcast where there are two arguments.
+(the camera looks down its -Z, +Y up, +X right). From two images alone, its translation can be found only up to scale.
+Batch dimensions are arbitrary and broadcast between two arguments.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lp_framework.geometry.spherical import relative_pose
 
 
 def from_opencv(camera: Tensor) -> Tensor:
-    """Camera to world `[..., 4, 4]` with our axes, of one with OpenCV's (x right, y down, looks down its +z).
+    """Convert camera-to-world matrices `[..., 4, 4]` from OpenCV axes (x right, y down, looks down +z) to ours.
 
     >>> from_opencv(torch.eye(4)).diagonal()
     tensor([ 1., -1., -1.,  1.])
@@ -24,7 +24,7 @@ def from_opencv(camera: Tensor) -> Tensor:
 
 
 def relative_camera(reference: Tensor, query: Tensor) -> Tensor:
-    """The relative camera of two cameras to world, all `[..., 4, 4]`.
+    """The relative camera of two camera-to-world matrices, all `[..., 4, 4]`.
 
     >>> left, right = (rigid_transform(torch.eye(3), torch.tensor([x, 0.0, 0.0])) for x in (1.0, 3.0))
     >>> relative_camera(left, right)[:3, 3]
@@ -34,10 +34,10 @@ def relative_camera(reference: Tensor, query: Tensor) -> Tensor:
 
 
 def at_optimal_scale(camera: Tensor, true: Tensor) -> Tensor:
-    """A relative camera with its translation t scaled so that it comes nearest to the true one's, t*.
+    """A relative camera with its translation t scaled to be as close as possible to the true one, t*.
 
-    The factor is max(0, t . t*) / (t . t), the paper's "optimal scale" (Details of Baseline Settings) for one pair; it
-    is never negative, for a camera does not change sides. Without a translation there is nothing to scale.
+    The factor is max(0, t . t*) / (t . t), the paper's "optimal scale" (Details of Baseline Settings) for one pair. It
+    is never negative, so that cameras do not switch sides. A zero translation is left unchanged.
 
     >>> ahead, true = (rigid_transform(torch.eye(3), torch.tensor(t)) for t in ([0.0, 0.0, 5.0], [1.0, 0.0, 2.0]))
     >>> at_optimal_scale(ahead, true)[:3, 3]
@@ -51,13 +51,13 @@ def at_optimal_scale(camera: Tensor, true: Tensor) -> Tensor:
 
 
 def pose_of_relative_camera(camera: Tensor, reference_radius: float) -> Tensor:
-    """Relative pose `[..., 3]` of a relative camera, for cameras that stand upright and look at the object's centre.
+    """Relative pose `[..., 3]` of a relative camera, for upright cameras that look at the object's centre.
 
-    Of two such cameras at latitudes a and b, a longitude d apart, the relative rotation is Rx(a) Ry(d) Rx(-b): it alone
-    tells d and, unless d is half a turn, b - a. The lines of sight then meet at the centre, `reference_radius` in front
-    of the reference; together with the direction of the translation that fixes the query's radius (in the least squares
-    sense where the lines pass each other), whatever the translation's length. Where they do not meet in front of both
-    cameras, or the translation lies along the query's line of sight or is nothing, the relative radius is 0.
+    For two such cameras at latitudes a and b with longitude difference d, the relative rotation is Rx(a) Ry(d) Rx(-b).
+    It determines d and, unless d is half a turn, b - a. The lines of sight meet at the centre, `reference_radius` in
+    front of the reference. With the direction of the translation, of any length, this determines the query's radius (by
+    least squares if the lines do not intersect). The relative radius is 0 if they do not meet in front of both cameras,
+    or if the translation is zero or lies along the query's line of sight.
 
     >>> from lp_framework.geometry.spherical import camera_to_world
     >>> reference, query = camera_to_world(torch.tensor([[0.1, 0.5, 1.5], [0.3, 1.0, 1.7]]))
@@ -68,7 +68,7 @@ def pose_of_relative_camera(camera: Tensor, reference_radius: float) -> Tensor:
     # (1 + cos d) times cosine and sine of b - a
     latitude = torch.atan2(rotation[..., 1, 2] - rotation[..., 2, 1], rotation[..., 1, 1] + rotation[..., 2, 2])
     sine = torch.linalg.vector_norm(rotation[..., 0, 1:], dim=-1)
-    leftwards = rotation[..., 0, 2] < rotation[..., 2, 0]  # their difference is sin d (cos a + cos b)
+    leftwards = rotation[..., 0, 2] < rotation[..., 2, 0]  # the difference is sin d (cos a + cos b)
     longitude = torch.atan2(torch.where(leftwards, -sine, sine), rotation[..., 0, 0])
 
     # length u - radius z = (0, 0, -reference_radius), with u the translation's direction and z the query's +Z
