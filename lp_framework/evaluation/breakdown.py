@@ -1,4 +1,4 @@
-"""What the rates of an evaluation do not tell: where they come from, and how far they and the model can be trusted."""
+"""Details behind the rates of an evaluation: by longitude and start, confidence intervals, and calibration."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 from lp_framework.data.pairs import ViewTable
 from lp_framework.geometry.spherical import wrap_angle
 
-THRESHOLDS = (15, 30)  # degrees, of the rotation error
-SURE_DEGREES = 30  # a model's probability is that of an error of at most so much
+THRESHOLDS = (15, 30)  # degrees, for the rotation error
+SURE_DEGREES = 30  # a model's probability is that of an error of at most this many degrees
 LONGITUDE_EDGES = (0, 45, 90, 135, 180)  # degrees
 STARTS = (1, 2, 4)
 CONFIDENCE_BINS = 10
@@ -22,13 +22,13 @@ RESAMPLES = 2000
 
 
 def breakdown(rows: Mapping[str, Tensor], table: ViewTable) -> dict[str, Any]:
-    """Of the rows of `PoseMetrics`, those of objects that have a unique answer or are not labelled.
+    """Break down the rows of `PoseMetrics` for objects that have a unique answer or are unlabelled.
 
-    R(R) at 15 and 30 degrees: `by_longitude`, the true difference of longitude; `best_of` the first starts, whichever
-    is chosen (with `start=modes` the highest modes); `interval`, 95% by bootstrap over objects, which is what another
-    choice of objects would change. `calibration`, where the model tells probabilities: of ten equal ranges of them the
+    R(R) at 15 and 30 degrees: `by_longitude`, by true longitude difference; `best_of`, for the best of the first starts
+    (with `start=modes`, the highest modes); `interval`, a 95% bootstrap interval over objects, for the variation due to
+    the choice of objects. `calibration`, if the model predicts probabilities, otherwise None: for ten equal bins, the
     mean probability and the share of pairs within 30 degrees, and `error`, the mean gap between the two (expected
-    calibration error, Guo et al. 2017), else None. Empty without such pairs.
+    calibration error, Guo et al. 2017). Empty if there are no such pairs.
     """
     counts = [answer is not False for answer in table.unique_answer]
     kept = np.array(counts)[rows["object"].numpy()]
@@ -55,7 +55,7 @@ def breakdown(rows: Mapping[str, Tensor], table: ViewTable) -> dict[str, Any]:
 
 
 def calibration(probability: NDArray, right: NDArray) -> dict[str, Any] | None:
-    """Probabilities `[P]`, NaN where there is none, against whether `[P]` the answers are right; see `breakdown`."""
+    """Calibration of probabilities `[P]` (NaN: none) given whether the answers are right `[P]`; see `breakdown`."""
     known = np.isfinite(probability)
     if not known.any():
         return None
@@ -79,7 +79,7 @@ def _recall(error: NDArray) -> dict[str, Any]:
 
 
 def _intervals(error: NDArray, objects: NDArray) -> dict[str, list[float]]:
-    """Rates of objects drawn with replacement: the 2.5% and 97.5% quantiles."""
+    """The 2.5% and 97.5% quantiles of the rates under resampling of objects with replacement."""
     names, place = np.unique(objects, return_inverse=True)
     drawn = np.random.default_rng(0).integers(len(names), size=(RESAMPLES, len(names)))
     pairs = np.bincount(place)[drawn].sum(axis=1)
@@ -91,7 +91,7 @@ def _intervals(error: NDArray, objects: NDArray) -> dict[str, list[float]]:
 
 
 def lines(told: Mapping[str, Any]) -> list[str]:
-    """The breakdown for people."""
+    """Format the breakdown for the terminal."""
 
     def rates(row: Mapping[str, Any]) -> str:
         shares = (row[f"R(R)@{degrees}"] for degrees in THRESHOLDS)

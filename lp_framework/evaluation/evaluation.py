@@ -1,4 +1,4 @@
-"""Evaluation: a solver on the pairs of a protocol, its errors gathered into metrics."""
+"""Evaluation: run a solver on the pairs of a protocol and gather its errors into metrics."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from lp_framework.solvers.starts import Starts
 
 
 class Evaluation(LightningModule):
-    """Runs a solver under `Trainer.test` with a `PairDataModule`, so on any number of devices and processes.
+    """Runs a solver under `Trainer.test` with a `PairDataModule`, on any number of devices and processes.
 
-    Afterwards `metrics.compute()` gives the metrics, `metrics.rows()` a row a pair. With a `journal` every batch is
-    kept as it comes, and batches that the journal has from an earlier run are not solved again.
+    Afterwards `metrics.compute()` returns the metrics and `metrics.rows()` one row per pair. With a `journal`, each
+    batch is saved when solved, and batches saved by an earlier run are not solved again.
 
-    With `views` it is of `solve_views` on the sets of so many images of `PairDataModule.evaluate_on`. Judged are
-    the pairs of a set's first image, as reference, with its others. A set has one answer, so SR equals R.
+    With `views`, `solve_views` is evaluated on sets of that many images, see `PairDataModule.evaluate_on`. Errors are
+    those of the pairs of a set's first image (reference) with the others. A set has one answer, so SR equals R.
     """
 
     table: ViewTable
@@ -42,15 +42,15 @@ class Evaluation(LightningModule):
     ) -> None:
         super().__init__()
         self.solver, self.starts, self.seed, self.journal, self.views = solver, starts, seed, journal, views
-        # Registered, so that Lightning moves the networks of both to the device.
+        # Registered so that Lightning moves the networks to the device.
         self.networks = torch.nn.ModuleList([*solver.networks(), *starts.networks()])
 
     def setup(self, stage: str) -> None:
-        """The objects are known once the data are prepared."""
+        """Create the metrics, once the data and their objects are known, and read the journal."""
         data: PairDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.gather_for(data.table(data.evaluation_split()))
         found: list[SolvedBatch] | UserError = []
-        # One process reads what an earlier run has solved, lest others meet what this run has added.
+        # Only one process reads the journal, so that no other reads lines added by this run.
         if self.journal is not None and self.trainer.is_global_zero:
             try:
                 found = self.journal.begin(data.fingerprint(data.evaluation_split()))
@@ -58,23 +58,23 @@ class Evaluation(LightningModule):
                 found = error
         found = self.trainer.strategy.broadcast(found)
         if isinstance(found, UserError):
-            raise found if self.trainer.is_global_zero else SystemExit(1)  # said once
+            raise found if self.trainer.is_global_zero else SystemExit(1)  # report it once
         if not found:
             return
         pairs = torch.cat([batch.pair for batch in found])
         data.leave_out(pairs.tolist())
         self.print(f"resuming: {len(pairs.unique(dim=0))} pairs are already solved")
-        # Each process has some, since a metric without any cannot be gathered.
+        # Each process needs some, because a metric without data cannot be gathered.
         for batch in found[self.trainer.global_rank :: self.trainer.world_size] or found[:1]:
             self.metrics.update(batch)
 
     def gather_for(self, table: ViewTable) -> None:
-        """Start with no results, for pairs of the views in `table`."""
+        """Reset the metrics, for pairs of the views in `table`."""
         self.table = table
         self.metrics = PoseMetrics(table, self.solver.one_answer)
 
     def solve(self, batch: PairBatch) -> Solution:
-        """The solver's solution of a batch's pairs, or of its sets as one of those pairs."""
+        """Solve a batch's pairs, or its sets; the solution of sets is returned as that of their pairs."""
         pairs = pairs_of(batch, self.device)
         starts = self.starts.make(pairs, self.seed)
         if self.views is None:
@@ -113,7 +113,7 @@ class Evaluation(LightningModule):
 
 
 def _of_chosen(solution: Solution) -> Tensor:
-    """The probability of each answer `[P]`, float64 on the CPU; NaN where the model tells none."""
+    """The probability of each answer `[P]`, float64 on the CPU; NaN if the model has none."""
     if solution.probability is None:
         return torch.full((len(solution.chosen),), torch.nan, dtype=torch.float64)
     return solution.probability.gather(1, solution.chosen[:, None])[:, 0].cpu().double()
@@ -122,8 +122,8 @@ def _of_chosen(solution: Solution) -> Tensor:
 def errors(solution: Solution, batch: PairBatch) -> tuple[Tensor, Tensor]:
     """Rotation (degrees) and translation errors `[P, N]` of the query's predicted camera, float64 on the CPU.
 
-    Full cameras are taken at the scale that suits each best (the paper's Details of Baseline Settings). A start that is
-    not valid has NaN, which the metrics count as a failure.
+    Full cameras are evaluated at their optimal scale (the paper's Details of Baseline Settings). Invalid starts have
+    NaN, which the metrics count as a failure.
     """
     reference, query = batch.reference.cpu(), batch.query.cpu()
     true = batch.cameras[query][:, None]

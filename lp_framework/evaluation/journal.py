@@ -1,10 +1,10 @@
-"""An evaluation's results as they come, from which a killed run goes on.
+"""A journal of an evaluation's results, from which an interrupted run resumes.
 
     <run>/unfinished/evaluation.json     what is evaluated: configuration, checkpoint, fingerprints; and the versions
-    <run>/unfinished/rank_0.jsonl ...    a line a batch of pairs, behind its checksum; a file a process
+    <run>/unfinished/rank_0.jsonl ...    one checksummed line per batch of pairs, one file per process
 
-The folder is there while the evaluation is unfinished. A line that a kill cut short, or that was altered, does not
-match its checksum, and its pairs are solved again. JSON keeps every bit of a number, NaN included.
+The folder exists while the evaluation is unfinished. If a line is truncated or altered, its checksum does not match,
+and its pairs are solved again. JSON round-trips numbers exactly, including NaN.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from lp_framework.evaluation.tables import RESULT, write_text
 
 FOLDER = "unfinished"
 SUBJECT = "evaluation.json"
-# What may change on the way.
+# Settings that may change when resuming.
 MOVABLE = ("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy", "pictures")
 
 
 class Journal:
-    """The journal of the run in `folder`, of an evaluation that `subject` describes: names and numbers, nested."""
+    """The journal of the run in `folder`; `subject` describes the evaluation by nested names and numbers."""
 
     def __init__(self, folder: Path, subject: Mapping[str, Any]) -> None:
         self.folder, self.run, self.subject = folder / FOLDER, folder, dict(subject)
 
     def begin(self, views: str) -> list[SolvedBatch]:
-        """What has been solved before, of data with the fingerprint `views`; else the journal is begun and the results
-        of a finished evaluation are removed. `UserError` for a journal of another one."""
+        """Return the batches solved before on data with the fingerprint `views`, or start a new journal and remove the
+        results of a finished evaluation. Raises `UserError` for a journal of another evaluation."""
         now = {**self.subject, "views": views}
         if begun(self.run, now) is not None:
             return list(self._read())
@@ -51,7 +51,7 @@ class Journal:
         return []
 
     def append(self, batch: SolvedBatch, rank: int) -> None:
-        """Keep a batch that the process of this rank has solved; it is on disk when this returns."""
+        """Save a batch solved by the process of this rank; it is on disk when this returns."""
         fields = batch._asdict().items()
         values = {name: each.tolist() if isinstance(each, torch.Tensor) else each for name, each in fields}
         text = json.dumps(values, separators=(",", ":")).encode()
@@ -60,13 +60,13 @@ class Journal:
         with writing(path), path.open("ab+") as file:
             if file.tell() > 0:
                 file.seek(-1, os.SEEK_END)
-                line = line if file.read(1) == b"\n" else b"\n" + line  # after a line that was cut short
+                line = line if file.read(1) == b"\n" else b"\n" + line  # after a truncated line
             file.write(line)
             file.flush()
             os.fsync(file.fileno())
 
     def finish(self) -> None:
-        """Remove the journal, when all that is made of it is there."""
+        """Remove the journal, once all results are written."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _read(self) -> Iterator[SolvedBatch]:
@@ -74,7 +74,7 @@ class Journal:
             for line in file.read_bytes().split(b"\n"):
                 checksum, _, text = line.partition(b" ")
                 if checksum == b"%08x" % zlib.crc32(text):
-                    # Of lists, which NumPy gives the 64 bits that their numbers have.
+                    # NumPy converts lists of numbers to 64-bit arrays.
                     values: dict[str, Any] = {
                         name: torch.from_numpy(np.array(value)) if isinstance(value, list) else value
                         for name, value in json.loads(text).items()
@@ -83,15 +83,15 @@ class Journal:
 
 
 def unfinished(folder: Path) -> dict[str, Any] | None:
-    """What the unfinished evaluation in a run's folder is of, None where there is none."""
+    """The subject of the unfinished evaluation in a run's folder, or None if there is none."""
     subject = read_record(folder / FOLDER / SUBJECT)
     whole = isinstance(subject.get("config"), dict) and isinstance(subject.get("checkpoint", ...), str | None)
     return subject if whole else None
 
 
 def begun(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What `unfinished` says where it is of this subject, or more than it; None where there is none, `UserError` for
-    another one that has solved anything."""
+    """The subject of the `unfinished` evaluation if it contains `subject`, otherwise None. Raises `UserError` for
+    another evaluation with solved batches."""
     before = unfinished(folder)
     changed = "" if before is None else changes(before, subject)
     if changed and any((folder / FOLDER).glob("rank_*.jsonl")):
@@ -103,9 +103,9 @@ def begun(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """In words, what of a subject has changed on which results depend, up to three of it; empty where nothing has.
+    """Describe up to three changes of a subject that affect results; empty if there are none.
 
-    What `now` does not hold has not changed, and a setting that one side does not know is off there.
+    Keys missing from `now` count as unchanged, and a setting missing on one side counts as off there.
 
     >>> changes({"config": {"seed": 1, "solver": {"gamma": 0.3}}}, {"config": {"seed": 1, "solver": {"gamma": 0}}})
     'solver.gamma is 0.3 there, 0 here'
@@ -120,14 +120,14 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:
-    """A subject by dotted keys, without the settings that change no result."""
+    """A subject by dotted keys, without settings that do not affect results."""
     left_out = {"plugins", "resume", "checkpoint", *MOVABLE}
     settings = {key: value for key, value in dotted(subject["config"]).items() if key not in left_out}
     return settings | {key: value for key, value in subject.items() if key not in ("config", "versions")}
 
 
 def dotted(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A config's values by their dotted keys; a list is one value.
+    """Flatten a config to dotted keys; a list is one value.
 
     >>> dotted({"seed": 1, "start": {"name": "ring", "count": 4}})
     {'seed': 1, 'start.name': 'ring', 'start.count': 4}

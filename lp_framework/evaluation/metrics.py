@@ -18,7 +18,7 @@ STATES = ("pair", "object", "rotation", "translation", "chosen", "answer", "prob
 
 
 class SolvedBatch(NamedTuple):
-    """What is kept of a batch of P pairs from N starts, and what the batch took."""
+    """Results of a batch of P pairs from N starts, and its cost."""
 
     pair: Tensor  # [P, 2] int64, rows of reference and query in the view table
     object: Tensor  # [P] int64
@@ -26,7 +26,7 @@ class SolvedBatch(NamedTuple):
     translation: Tensor  # [P, N] float64, scene units
     chosen: Tensor  # [P] int64
     answer: Tensor  # [P, 3] float64
-    probability: Tensor  # [P] float64, of the answer to be within 30 degrees; NaN where the model tells none
+    probability: Tensor  # [P] float64, that the answer is within 30 degrees; NaN if the model has none
     seconds: float
     passes: int
 
@@ -34,8 +34,8 @@ class SolvedBatch(NamedTuple):
 def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str, float]:
     """The metrics of P pairs with N starts: errors `[P, N]` (degrees, scene units), chosen start `[P]`.
 
-    R@d: share of pairs whose chosen start is within d degrees and 0.2; R(R)@d by rotation alone; SR, SR(R): the same
-    over all starts. The errors are medians over the chosen starts. What is NaN counts as a failure.
+    R@d: share of pairs whose chosen start is within d degrees and 0.2; R(R)@d: by rotation only; SR, SR(R): the same
+    over all starts. The errors are medians over the chosen starts. NaN counts as a failure.
 
     >>> summary = summarise(torch.tensor([[4.0, 90.0]]), torch.tensor([[0.3, 2.0]]), torch.tensor([0]))
     >>> summary["R@5"], summary["R(R)@5"], summary["SR(R)@5"]
@@ -53,16 +53,16 @@ def summarise(rotation: Tensor, translation: Tensor, chosen: Tensor) -> dict[str
             metrics[f"{prefix}@{threshold}"] = (turned & (distance <= TRANSLATION_THRESHOLD)).double().mean().item()
             metrics[f"{prefix}(R)@{threshold}"] = turned.double().mean().item()
     for name, values in (("rotation_error", rotation), ("translation_error", translation)):
-        # Of an even count the mean of the middle two; torch's median takes the lower one.
+        # For an even count, the mean of the middle two; torch's median takes the lower one.
         metrics[name] = float(np.median(values.gather(1, pick).double().numpy()))
     return metrics
 
 
 class PoseMetrics(HostMetric):
-    """Gathers a row a pair of the views in `table`; a solver with `one_answer` a pair has no success rates over
+    """Gathers one row per pair of the views in `table`; solvers with `one_answer` per pair have no success rates over
     starts."""
 
-    batch: list[Tensor]  # the first pair of each
+    batch: list[Tensor]  # the first pair of each batch
     cost: list[Tensor]  # pairs, seconds, passes of each batch
 
     def __init__(self, table: ViewTable, one_answer: bool = False) -> None:
@@ -80,18 +80,18 @@ class PoseMetrics(HostMetric):
         self.cost.append(torch.tensor([[len(solved.pair), solved.seconds, solved.passes]], dtype=torch.float64))
 
     def rows(self) -> dict[str, Tensor]:
-        """One row a pair, of all processes, by ascending reference and query, each pair once."""
-        self.compute()  # which is kept until the next update
+        """One row per pair, from all processes, without duplicates, sorted by reference and query."""
+        self.compute()  # cached until the next update
         return self._rows
 
     def compute(self) -> dict[str, Any]:
-        """The metrics of all pairs, of objects with a unique answer (None where there are none), by object and by
-        ambiguity class; `unanswered`, the share of pairs without an answer; the number of pairs and the cost of one."""
-        # Here, and only here, torchmetrics has the states of all processes together.
+        """The metrics over all pairs, over objects with a unique answer (None if there are none), per object and per
+        ambiguity class; `unanswered`, the share of pairs without an answer; number of pairs and cost per pair."""
+        # Only here does torchmetrics provide the states of all processes.
         gathered = {state: dim_zero_cat(getattr(self, state)) for state in STATES}
         order = first_of_each(gathered["pair"])
         self._rows = rows = {state: value[order] for state, value in gathered.items()}
-        # However many processes have met a batch, it counts once.
+        # A batch counts once, even if several processes solved it.
         cost = dim_zero_cat(self.cost)[first_of_each(dim_zero_cat(self.batch))].sum(dim=0)
 
         def over(chosen: Tensor) -> dict[str, float] | None:

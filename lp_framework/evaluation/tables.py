@@ -1,4 +1,4 @@
-"""Results as tables: in the terminal in the paper's layout, and on disk as JSON and CSV."""
+"""Tables of results: in the terminal in the paper's layout, and on disk as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, STATES, PoseMet
 RESULT = "results.json"  # of a finished evaluation
 COLUMNS = [f"{prefix}@{degrees}" for prefix in ("R", "R(R)", "SR", "SR(R)") for degrees in ROTATION_THRESHOLDS]
 ERRORS = ["rotation_error", "translation_error"]
-WIDE = 100  # columns of a terminal that hold the whole table
+WIDE = 100  # terminal columns needed for the whole table
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+    """Write a text file atomically."""
     with written(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all; what is not finite becomes null."""
+    """Write JSON atomically; non-finite numbers become null."""
     write_text(path, json.dumps(finite(content), indent=2) + "\n")
 
 
 def finite(value: Any) -> Any:
-    """A value that JSON can hold: mappings, lists and plain values, with None for numbers that are not finite."""
+    """Replace non-finite numbers by None, as JSON needs, in nested mappings, lists and plain values."""
     if isinstance(value, Mapping):
         return {str(key): finite(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -46,13 +46,13 @@ def finite(value: Any) -> Any:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write arrays by name, `.npz`, whole or not at all."""
-    with written(path) as partial, partial.open("wb") as file:  # given a name, NumPy would add a suffix to it
+    """Write named arrays to `.npz` atomically."""
+    with written(path) as partial, partial.open("wb") as file:  # given a path, NumPy would append a suffix
         np.savez(file, **arrays)  # type: ignore[arg-type]  # of the stub
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write CSV whole or not at all."""
+    """Write CSV atomically."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -61,7 +61,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[object
 
 
 def summary_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, float]]]:
-    """The rows of the summary: all objects, those with a unique answer, each ambiguity class; empty ones left out."""
+    """The non-empty rows of the summary: all objects, those with a unique answer, and each ambiguity class."""
     rows = [("all objects", result["metrics"]), ("unique answer", result["metrics_unique_answer"])]
     if len(result["per_ambiguity"]) > 1:
         rows += [(f"  {name}", metrics) for name, metrics in result["per_ambiguity"].items()]
@@ -69,9 +69,9 @@ def summary_rows(result: Mapping[str, Any]) -> list[tuple[str, Mapping[str, floa
 
 
 def terminal_tables(title: str, rows: Sequence[tuple[str, Mapping[str, float]]], width: int) -> list[Table]:
-    """The paper's layout: at each threshold R and R(R), then SR and SR(R), then the median errors.
+    """The paper's layout: R and R(R) at each threshold, then SR and SR(R), then the median errors.
 
-    Where `width` columns do not hold it, the success rates are in a table of their own.
+    If that exceeds `width` columns, the success rates get their own table.
     """
     parts = [("R", "SR")] if width >= WIDE else [("R",), ("SR",)]
     return [_terminal_table(title if part is parts[0] else "", rows, part) for part in parts]
@@ -98,7 +98,7 @@ def _terminal_table(title: str, rows: Sequence[tuple[str, Mapping[str, float]]],
 
 
 def write_result(folder: Path, result: Mapping[str, Any], metrics: PoseMetrics, table: ViewTable) -> None:
-    """`results.csv` (a row an object and summary row), `pairs.csv` (a row a pair) and, last, `results.json`."""
+    """Write `results.csv` (objects and summary rows), `pairs.csv` (one row per pair) and, last, `results.json`."""
     rows = [*summary_rows(result), *((name, row) for name, row in result["per_object"].items() if row is not None)]
     keys = [*COLUMNS, *ERRORS]
     lines = [[name.strip(), *(round(row[key], 5) if key in row else "" for key in keys)] for name, row in rows]
@@ -114,7 +114,7 @@ PAIR_COLUMNS = (
 
 
 def pair_rows(metrics: PoseMetrics, table: ViewTable) -> list[list[object]]:
-    """A row a pair with the answer (relative pose, degrees) and its errors."""
+    """One row per pair with the answer (relative pose, degrees) and its errors."""
     rows = metrics.rows()
     lines: list[list[object]] = []
     for solved in zip(*(rows[state].tolist() for state in STATES), strict=True):
