@@ -22,7 +22,7 @@ def scaled_linear_alphas(num_timesteps: int = 1000, start: float = 0.00085, end:
 
 
 def ddim_timesteps(steps: int, num_timesteps: int = 1000) -> list[int]:
-    """The timesteps visited, from noise to image.
+    """The timesteps visited when sampling, from noise to image.
 
     >>> ddim_timesteps(5)
     [801, 601, 401, 201, 1]
@@ -34,7 +34,7 @@ def ddim_timesteps(steps: int, num_timesteps: int = 1000) -> list[int]:
 
 
 def ddim_step(latent: Tensor, noise: Tensor, alpha: Tensor, alpha_next: Tensor, eta: float, fresh: Tensor) -> Tensor:
-    """The latent one step nearer to the image (Eq. 12); `fresh` is standard normal noise, its share `eta` (Eq. 16)."""
+    """One denoising step (Eq. 12); `fresh` is standard normal noise, with a share of `eta` (Eq. 16)."""
     sigma = eta * ((1 - alpha_next) / (1 - alpha) * (1 - alpha / alpha_next)).sqrt()
     image = (latent - (1 - alpha).sqrt() * noise) / alpha.sqrt()  # "predicted x_0"
     direction = (1 - alpha_next - sigma.square()).sqrt() * noise  # "direction pointing to x_t"
@@ -49,9 +49,9 @@ def ddim_sample(
     eta: float,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """Latents `[B, ...]` from the noise `start`, in `steps`; `predict(latent, timestep)` is epsilon_theta.
+    """Sample latents `[B, ...]` from the noise `start` in `steps` steps; `predict(latent, timestep)` is epsilon_theta.
 
-    Fresh noise is the same for all of a batch, see `standard_normal`.
+    Fresh noise is shared by the whole batch, see `standard_normal`.
     """
     if not 0 <= eta <= 1:
         raise UserError(f"eta must lie in [0, 1], got {eta}")
@@ -67,14 +67,14 @@ def ddim_sample(
 def standard_normal(like: Tensor, generator: torch.Generator | None) -> Tensor:
     """Standard normal noise of the shape, device and dtype of `like` `[B, ...]`, drawn on the generator's device.
 
-    All of a batch have the same: views then differ by what they are asked for alone, and are the same in any batch.
+    The batch shares one draw, so that views differ only by their conditioning and do not depend on the batch.
     """
     device = generator.device if generator is not None else like.device
     return torch.randn(like.shape[1:], generator=generator, device=device).to(like).expand_as(like)
 
 
 def guided(unconditional: Tensor, conditional: Tensor, guidance: float) -> Tensor:
-    """Classifier-free guidance (Ho and Salimans 2022) of predicted noise; `guidance` 1 is the conditional alone."""
+    """Classifier-free guidance (Ho and Salimans 2022) of predicted noise; `guidance` 1 returns the conditional one."""
     if not guidance >= 0:
         raise UserError(f"guidance must not be negative, got {guidance}")
     return unconditional + guidance * (conditional - unconditional)

@@ -1,4 +1,4 @@
-"""The tiny prior's networks: an image's latents and code, how a relative pose steers it, the Gaussian it predicts."""
+"""Networks of the tiny prior: latents and code of an image, steering by a relative pose, predicted Gaussian."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from lp_framework.models.networks import ResidualLayer
 from lp_framework.models.view_head import scaled
 from lp_framework.priors.base import resized
 
-IMAGE_SIZE = 64  # pixels a side of what is decoded
-LATENT_PIXELS = 32  # of what the latents are taken from
-CONSTANT, WAVES = 64, 8  # numbers of a code that a turn leaves as they are; waves of each order
+IMAGE_SIZE = 64  # side length of decoded images in pixels
+LATENT_PIXELS = 32  # side length of the images that latents are computed from
+CONSTANT, WAVES = 64, 8  # rotation-invariant entries of a code; waves of each order
 
 
 def shrink(images: Tensor) -> Tensor:
-    """Pixels `[B, 3 * 64 * 64]` of images `[B, 3, H, W]`."""
+    """Downsize images `[B, 3, H, W]` to pixels `[B, 3 * 64 * 64]`."""
     return resized(images, IMAGE_SIZE).flatten(1)
 
 
 def _halve(pixels: Tensor) -> Tensor:
-    """Pixels `[B, 3 * 32 * 32]` of `[B, 3 * 64 * 64]`."""
+    """Downsize pixels `[B, 3 * 64 * 64]` to `[B, 3 * 32 * 32]`."""
     return functional.avg_pool2d(pixels.view(-1, 3, IMAGE_SIZE, IMAGE_SIZE), 2).flatten(1)
 
 
 class PrincipalLatents(nn.Module):
     """The first `dim` principal components of 32 x 32 images, scaled so that their mean square is `scale`^2.
 
-    A linear map, so that noise of the latents is noise of the image; `spread` `[dim]` are the standard deviations.
+    The map is linear, so noise in the latents is noise in the image; `spread` `[dim]` are the standard deviations.
     """
 
     def __init__(self, dim: int, scale: float) -> None:
@@ -44,21 +44,21 @@ class PrincipalLatents(nn.Module):
 
     @torch.no_grad()
     def fit(self, pixels: Tensor) -> None:
-        """Take the basis from pixels `[I, 3 * 64 * 64]`; with fewer images than `dim` the rest of it is zero."""
+        """Fit the basis to pixels `[I, 3 * 64 * 64]`; with fewer images than `dim`, the rest of it is zero."""
         small = _halve(pixels.float()).cpu().double()
         mean = small.mean(dim=0)
         rows = (small - mean) / len(small) ** 0.5
         if len(rows) >= rows.shape[1]:
             variances, vectors = torch.linalg.eigh(rows.T @ rows)
-        else:  # those of the smaller product, mapped over
+        else:  # eigenvectors of the smaller product, mapped back
             variances, vectors = torch.linalg.eigh(rows @ rows.T)
             vectors = functional.normalize(rows.T @ vectors, dim=0)
-        variances, vectors = variances.flip(0), vectors.flip(1)  # from the largest to the least
+        variances, vectors = variances.flip(0), vectors.flip(1)  # in descending order
         missing = max(0, self.dim - len(variances))
         variances = functional.pad(variances[: self.dim].clamp(min=0), (0, missing))
         vectors = functional.pad(vectors[:, : self.dim], (0, missing))
         variances = torch.where(variances > 1e-9 * variances[0], variances, 0)
-        vectors = vectors * torch.where(vectors.sum(dim=0) < 0, -1, 1)  # the sign is free
+        vectors = vectors * torch.where(vectors.sum(dim=0) < 0, -1, 1)  # fix the arbitrary sign
         factor = self.scale / variances.mean().sqrt()
         self.mean.copy_(mean)
         self.basis.copy_(vectors * (variances > 0) * factor)
@@ -70,7 +70,7 @@ class PrincipalLatents(nn.Module):
 
 
 class ImageDecoder(nn.Module):
-    """Latents `[B, dim]` to images `[B, 3, 64, 64]` in [-1, 1]: a linear map to 8 x 8, three doublings."""
+    """Decodes latents `[B, dim]` to images `[B, 3, 64, 64]` in [-1, 1]: linear map to 8 x 8, three upsamplings."""
 
     def __init__(self, dim: int, channels: int = 64) -> None:
         super().__init__()
@@ -102,20 +102,20 @@ class Gaussian(NamedTuple):
 
 
 def code_dim(orders: int) -> int:
-    """Numbers in a code: a constant part, `orders` x `WAVES` complex waves, a place (scaled latitude and radius)."""
+    """Size of a code: a constant part, `orders` x `WAVES` complex waves, and scaled latitude and radius."""
     return CONSTANT + 2 * WAVES * orders + 2
 
 
 def readout(code: Tensor, orders: int) -> Tensor:
-    """Of codes `[B, code_dim]` the numbers `[B, 4]` that stand for the view pose (see `relative_pose_loss`)."""
+    """The entries `[B, 4]` of codes `[B, code_dim]` that represent the view pose (see `relative_pose_loss`)."""
     waves = code[:, CONSTANT:-2].view(-1, 2, orders, WAVES)
     return torch.cat([waves[:, :, 0, 0], code[:, -2:]], dim=1)
 
 
 def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
-    """Codes `[..., code_dim]` (see `code_dim`) as seen from relative poses `[..., 3]` away.
+    """Transform codes `[..., code_dim]` (see `code_dim`) by relative poses `[..., 3]`.
 
-    A wave of order m turns by m times the relative longitude, and the place moves by the relative latitude and radius.
+    A wave of order m rotates by m times the relative longitude; relative latitude and radius are added to theirs.
     """
     constant, waves, place = code[..., :CONSTANT], code[..., CONSTANT:-2], code[..., -2:]
     real, imaginary = waves.unflatten(-1, (2, orders, WAVES)).unbind(dim=-3)
@@ -127,7 +127,7 @@ def steer(code: Tensor, pose: Tensor, orders: int) -> Tensor:
 
 
 class TinyNetworks(nn.Module):
-    """All that is trained (and the latents' basis). `predict` is the model: p(target's latents | source, pose)."""
+    """All trained networks and the latents' basis. `predict` is the model p(target's latents | source, pose)."""
 
     def __init__(self, feature_dim: int, latent_dim: int, scale: float, orders: int, width: int, layers: int) -> None:
         super().__init__()
@@ -138,18 +138,18 @@ class TinyNetworks(nn.Module):
         nn.init.zeros_(last.weight[latent_dim:])
         nn.init.constant_(last.bias[latent_dim:], math.log(0.3 * scale))
         first = nn.Linear(code_dim(orders), width)
-        hidden = [ResidualLayer(width, nn.SiLU()) for _ in range(layers)]  # smooth, since solvers differentiate it
+        hidden = [ResidualLayer(width, nn.SiLU()) for _ in range(layers)]  # smooth, because solvers differentiate it
         self.head = nn.Sequential(first, *hidden, last)
         self.decoder = ImageDecoder(latent_dim)
 
     def predict(self, code: Tensor, pose: Tensor) -> Gaussian:
-        """The Gaussian over the target's latents for codes `[..., code_dim]` of sources, relative poses `[..., 3]`."""
+        """The Gaussian over the target's latents, given source codes `[..., code_dim]` and poses `[..., 3]`."""
         mean, log_spread = self.head(steer(code, pose, self.orders)).chunk(2, dim=-1)
         return Gaussian(mean, log_spread)
 
 
 def predicted_noise(noisy: Tensor, alpha: Tensor, predicted: Gaussian) -> Tensor:
-    """epsilon_theta: the expected noise in `noisy` `[..., D]`, given that the clean latents are as `predicted`.
+    """epsilon_theta: the expected noise in `noisy` `[..., D]` if the clean latents are distributed as `predicted`.
 
     With z = sqrt(alpha) z_0 + sqrt(1 - alpha) epsilon and z_0 ~ N(mu, s^2), E[epsilon | z] =
     sqrt(1 - alpha) (z - sqrt(alpha) mu) / (alpha s^2 + 1 - alpha); `alpha` (alpha-bar_t) broadcasts to `[..., 1]`.

@@ -1,4 +1,4 @@
-"""The tiny prior as an energy over relative poses, as a generator of novel views, and its training (`model=prior`)."""
+"""The tiny prior: energy over relative poses, generation of novel views, and training (`model=prior`)."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from lp_framework.priors.tiny.networks import IMAGE_SIZE, Gaussian, TinyNetworks
 from lp_framework.registry import register
 
 Denoised = tuple[Tensor, Gaussian]
-DECODED = 16  # images a step that the decoder is trained on; it is the costliest part
+DECODED = 16  # images per step for training the decoder, which is the most expensive part
 
 
 class TrunkAndPixels:
-    """What of an image is computed once: a frozen trunk's features, and the pixels of the small image after them."""
+    """The cached part of an image: the features of a frozen trunk, followed by the pixels of the downsized image."""
 
     def __init__(self, backbone: Backbone) -> None:
         self.backbone, self.to = backbone, backbone.to
@@ -75,7 +75,7 @@ class PriorModel(TrainedModule):
         return TrunkAndPixels(self.backbone) if self.backbone.frozen else None
 
     def on_fit_start(self) -> None:
-        """The latents' basis is that of the training views; a run that goes on has it already."""
+        """Fit the latents' basis to the training views; a resumed run already has it."""
         if self.networks.latents.spread.any():
             return
         data = self.trainer.datamodule.data("train")  # type: ignore[attr-defined]
@@ -97,7 +97,7 @@ class PriorModel(TrainedModule):
         residual, predicted = self.residual(source, pose, latents[batch.query], timestep, noise)
         view_loss = relative_pose_loss(readout(code, self.networks.orders), batch)
 
-        # The decoder sees what it will have to decode: latents of views, and samples of what is predicted.
+        # The decoder is trained on what it decodes later: latents of views, and samples of the predictions.
         chosen = torch.randperm(len(batch), generator=generator)[:DECODED].to(self.device)
         seen = torch.arange(len(chosen), device=self.device)[:, None] % 2 == 0
         query = batch.query[chosen]
@@ -128,7 +128,7 @@ class PriorModel(TrainedModule):
         return shrink(batch.images) if batch.features is None else batch.features[:, self.backbone.trunk_dim :]
 
     def residual(self, code: Tensor, pose: Tensor, latents: Tensor, timestep: Tensor, noise: Tensor) -> Denoised:
-        """Predicted minus true noise `[P, D]` in noised latents seen from the code's image, and the `Gaussian`."""
+        """Predicted minus true noise `[P, D]` of noised latents given source codes, and the predicted `Gaussian`."""
         alpha = self.alphas_cumprod[timestep][:, None]
         noisy = alpha.sqrt() * latents + (1 - alpha).sqrt() * noise
         predicted = self.networks.predict(code, pose)
@@ -137,11 +137,11 @@ class PriorModel(TrainedModule):
 
 @register("prior", "tiny")
 class TinyPrior(Prior):
-    """A small diffusion model that comes trained on the embedded objects.
+    """A small diffusion model, bundled with weights trained on the embedded objects.
 
-    `path`, for one of your own, is a run of `train model=prior`, or a folder that `convert` made of it. The target's
-    latents are predicted to be Gaussian, with a mean and a spread that depend on source and pose, so the denoiser has a
-    closed form and never finds the target's pose in the noised target: the energy depends on it at every timestep.
+    Set `path` to use your own: a run of `train model=prior`, or a folder made from it by `convert`. The prediction for
+    the target's latents is a Gaussian whose mean and spread depend on source and pose. The denoiser therefore has a
+    closed form and cannot infer the pose from the noised target, so the energy depends on the pose at every timestep.
     """
 
     def __init__(self, path: str | None = None) -> None:
@@ -160,7 +160,7 @@ class TinyPrior(Prior):
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> ViewCode:
-        """See `Prior.encode`: principal components `[B, D, 1, 1]`, and a code that poses steer `[B, 1, code_dim]`."""
+        """See `Prior.encode`: principal components `[B, D, 1, 1]`, and a steerable code `[B, 1, code_dim]`."""
         latents, codes = self.model.code(images.float())
         return ViewCode(latents[..., None, None], codes[:, None])
 

@@ -1,4 +1,4 @@
-"""A function's work on a GPU, recorded once and replayed: one launch from the host in place of a thousand."""
+"""CUDA graphs: record a function's GPU work once and replay it with one launch instead of a thousand."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 Function = Callable[..., tuple[Tensor, ...]]
-WARM_UP = 2  # calls before a recording, in which libraries choose kernels
+WARM_UP = 2  # calls before recording, in which libraries choose kernels
 
 
 class Replayed:
-    """Runs a function of tensors by CUDA graphs: one for each combination of shapes and dtypes it is called with.
+    """Runs a function of tensors with CUDA graphs, one for each combination of input shapes and dtypes.
 
-    It is always the same function, handed over at each call lest its networks live as long as this does. A recording
-    keeps the addresses of all that the function reads, its networks' weights too: `forget` the recordings when those
-    move. The function must not look at values: what it computes from them on the host would stay as it was. On a CPU
-    it is called as it is.
+    The function must always be the same one; it is passed per call to avoid keeping its networks alive. A recording
+    stores the addresses of everything that the function reads, including network weights: call `forget` when they
+    move. The function must not read tensor values on the host, because results computed from them would be frozen in
+    the recording. On a CPU the function is called directly.
     """
 
     def __init__(self) -> None:
@@ -35,26 +35,26 @@ class Replayed:
         return self.recordings[key](*inputs)
 
     def __reduce__(self) -> tuple[type[Replayed], tuple[()]]:
-        return Replayed, ()  # a copy has addresses of its own
+        return Replayed, ()  # a copy has its own addresses
 
     def forget(self) -> bool:
-        """Give the recordings' memory back, and record anew at the next call; whether there were any."""
+        """Free the recordings and record again at the next call; returns whether there were any."""
         any_there = bool(self.recordings)
         self.recordings.clear()
         return any_there
 
     def _pool(self) -> Any:
-        """The memory of the recordings. All share it: nothing of a replay is needed once its results are out."""
+        """The memory pool shared by all recordings; after a replay, nothing but its copied results is needed."""
         return next((each.graph.pool() for each in self.recordings.values()), None)
 
 
 def can_record(device: torch.device) -> bool:
-    """Whether there are CUDA graphs on a device."""
+    """Whether a device supports CUDA graphs."""
     return device.type == "cuda"
 
 
 class Recording:
-    """What a function does with inputs of some shapes."""
+    """The CUDA graph of a function for fixed input shapes."""
 
     def __init__(self, function: Function, inputs: tuple[Tensor, ...], pool: Any) -> None:
         with torch.cuda.device(inputs[0].device):
@@ -65,7 +65,7 @@ class Recording:
                 for _ in range(WARM_UP):
                     function(*self.inputs)
             torch.cuda.current_stream().wait_stream(stream)
-            # Errors by threads: a loader's may pin memory meanwhile.
+            # Thread-local errors, because a data loader's thread may pin memory during capture.
             with (
                 _workspaces_of_its_own(),
                 torch.cuda.graph(self.graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
@@ -76,15 +76,15 @@ class Recording:
         for kept, given in zip(self.inputs, inputs, strict=True):
             kept.copy_(given)
         self.graph.replay()
-        return tuple(each.clone() for each in self.outputs)  # the next replay writes over them
+        return tuple(each.clone() for each in self.outputs)  # the next replay overwrites them
 
 
 @contextmanager
 def _workspaces_of_its_own() -> Iterator[None]:
-    """Workspaces of cuBLAS come from the recording's memory, and nobody else finds them there.
+    """Allocate cuBLAS workspaces from the recording's memory and share them with no other recording.
 
-    Otherwise PyTorch hands them on to the next recording on the stream, and frees them with the first one. As in
-    PyTorch's own `torch._inductor.cudagraph_trees`, there is no public way.
+    Otherwise PyTorch reuses them for the next recording on the stream and frees them with the first one. There is no
+    public API for this; PyTorch's own `torch._inductor.cudagraph_trees` does the same.
     """
     torch._C._cuda_clearCublasWorkspaces()
     try:

@@ -1,4 +1,4 @@
-"""Zero123's four networks: diffusers' U-Net and autoencoder, transformers' CLIP image encoder, the pose projection."""
+"""Zero123's networks: diffusers' U-Net and autoencoder, transformers' CLIP image encoder, and the pose projection."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 Dtype = Literal["float32", "bfloat16", "float16"]
 Attention = Literal["sdpa", "math"]
 
-# In the words of diffusers' and transformers' config.json.
+# With the keys of diffusers' and transformers' config.json.
 Configs = Mapping[str, Mapping[str, Any]]
 Weights = Mapping[str, Mapping[str, StoredTensor]]
 
@@ -32,7 +32,7 @@ POSE_CHANNELS = 4  # of the conditioning vector T
 def unet_config(
     channels: list[int], layers: int, attention: list[bool], heads: int, context: int, latent: int = 4
 ) -> dict[str, Any]:
-    """Config of the U-Net: channels and whether there is attention, a level each from fine to coarse."""
+    """Config of the U-Net; channels and use of attention are per level, from fine to coarse."""
     return {
         "sample_size": 32,
         "in_channels": 2 * latent,  # the noised target and the source
@@ -41,13 +41,13 @@ def unet_config(
         "layers_per_block": layers,
         "down_block_types": ["CrossAttnDownBlock2D" if each else "DownBlock2D" for each in attention],
         "up_block_types": ["CrossAttnUpBlock2D" if each else "UpBlock2D" for each in reversed(attention)],
-        "attention_head_dim": heads,  # sic: diffusers calls the number of heads so
+        "attention_head_dim": heads,  # sic: diffusers' name for the number of heads
         "cross_attention_dim": context,
     }
 
 
 def vae_config(channels: list[int], layers: int, latent: int = 4) -> dict[str, Any]:
-    """Config of the autoencoder: channels of each level, from fine to coarse."""
+    """Config of the autoencoder; channels are per level, from fine to coarse."""
     return {
         "in_channels": 3,
         "out_channels": 3,
@@ -62,7 +62,7 @@ def vae_config(channels: list[int], layers: int, latent: int = 4) -> dict[str, A
 
 
 def clip_config(width: int, layers: int, patch: int, image_size: int, projection: int) -> dict[str, Any]:
-    """Config of OpenAI's CLIP vision transformer; its heads are 64 wide."""
+    """Config of OpenAI's CLIP vision transformer, with heads of width 64."""
     return {
         "hidden_size": width,
         "intermediate_size": 4 * width,
@@ -84,13 +84,13 @@ PUBLISHED: Configs = {  # the sizes of Zero123 and Zero123-XL: Stable Diffusion 
 
 
 def packages() -> list[ModuleType]:
-    """Diffusers and transformers; `UserError` naming the one that is not installed."""
+    """Import diffusers and transformers; raises `UserError` naming the one that is not installed."""
     install = "pip install 'lp_framework[zero123]'"
     return [optional_import(name, "Zero123", install) for name in ("diffusers", "transformers")]
 
 
 class Networks(nn.Module):
-    """The four networks, with random weights."""
+    """The four networks with random weights."""
 
     def __init__(self, configs: Configs) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class Networks(nn.Module):
 
 
 class SingleToken:
-    """Cross-attention over one token: its weight is 1 whatever the query, so every position receives its value."""
+    """Cross-attention over a single token: its weight is always 1, so every position receives its value."""
 
     def __call__(self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor, **unused: Any) -> Tensor:
         value = attn.to_out[0](attn.to_v(encoder_hidden_states))  # [B, 1, channels]
@@ -112,7 +112,7 @@ class SingleToken:
 
 
 class SelfAttention:
-    """Self-attention by `scaled_dot_product_attention`, with PyTorch's plain kernel where a fused one cannot do."""
+    """Self-attention by `scaled_dot_product_attention`, with the math kernel where fused ones are not supported."""
 
     def __init__(self, kernel: Attention) -> None:
         self.kernel = kernel
@@ -129,7 +129,7 @@ class SelfAttention:
 
 
 def choose_attention(unet: Any, kernel: Attention) -> None:
-    """Give a U-Net whose context is a single token these processors."""
+    """Set the attention processors of a U-Net whose context is a single token."""
     processors = {
         name: SingleToken() if name.endswith("attn2.processor") else SelfAttention(kernel)
         for name in unet.attn_processors
@@ -138,13 +138,13 @@ def choose_attention(unet: Any, kernel: Attention) -> None:
 
 
 def assemble(origin: str, configs: Configs, weights: Weights, dtype: Dtype) -> Networks:
-    """The networks with these weights, whose `origin` a `UserError` for unfit sizes or tensors names."""
+    """Build the networks with these weights; raises `UserError` naming `origin` if sizes or tensors do not fit."""
     with expecting(f"{origin}: its sizes are not those of Zero123's networks"), torch.device("meta"):
         networks = Networks(configs)
-    embeddings = networks.image_encoder.vision_model.embeddings  # its numbers of patches are in no file
+    embeddings = networks.image_encoder.vision_model.embeddings  # its patch indices are not stored in files
     embeddings.position_ids = torch.arange(embeddings.position_embedding.num_embeddings)[None]
     for part, network in networks.named_children():
-        single = part == "cc_projection"  # small, and what poses pass through
+        single = part == "cc_projection"  # small, and it processes poses
         _load(f"{origin}, {part}", network, weights[part], torch.float32 if single else DTYPES[dtype])
     return networks
 
@@ -156,7 +156,7 @@ def _load(origin: str, network: nn.Module, weights: Mapping[str, StoredTensor], 
         tensor = stored.map()
         if tensor.ndim == 4 and dimensions.get(name) == 2:  # a 1x1 convolution of the autoencoder's attention
             tensor = tensor.flatten(1)
-        # What is stored in the wanted type stays mapped, and processes share it; else the file's bytes are let go of.
+        # Tensors stored in the wanted dtype stay mapped and shared by processes; otherwise the mapping is released.
         as_wanted = tensor.dtype == dtype and tensor.is_contiguous()
         tensors[name] = tensor if as_wanted else torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
     try:

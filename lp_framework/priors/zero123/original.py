@@ -1,7 +1,7 @@
-"""Checkpoints of the published training code (latent-diffusion): sizes from the tensors, tensors by diffusers' names.
+"""Checkpoints of the published training code (latent-diffusion): infer sizes and rename tensors to diffusers' names.
 
-`model.diffusion_model` is the U-Net and `model_ema` its moving averages, `first_stage_model` the autoencoder,
-`cond_stage_model` OpenAI's CLIP, of which Zero123 uses the image half.
+`model.diffusion_model` is the U-Net and `model_ema` its moving averages, `first_stage_model` the autoencoder, and
+`cond_stage_model` OpenAI's CLIP, of which Zero123 uses only the image encoder.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ Tensors = Mapping[str, StoredTensor]
 UNET, VAE, CLIP, PROJECTION = "model.diffusion_model.", "first_stage_model.", "cond_stage_model.", "cc_projection."
 EMA = "model_ema."
 VISUAL = f"{CLIP}model.visual."
-# What a checkpoint may hold besides: the schedule's tables, CLIP's text half, the training loss of the autoencoder.
+# Other allowed contents of a checkpoint: the schedule's tables, CLIP's text half, the autoencoder's training loss.
 LEFT_OVER = re.compile(
     r"betas|(sqrt_|log_)?(one_minus_|recip_|recipm1_)?alphas_cumprod(_prev)?|posterior_\w+|logvar|scale_factor|"
     r"lvlb_weights|model_ema\..*|cond_stage_model\.(?!model\.visual\.).*|first_stage_model\.loss\..*"
 )
-# Each network has a table from the training code's modules to diffusers', which `_renamed` applies; inverted, it leads
-# back. Modules that have the same name in both are in no table.
+# Each network has a table from the training code's modules to diffusers', which `_renamed` applies; it can be inverted
+# to convert back. Modules with the same name in both are omitted.
 RESNET = {
     **{"in_layers.0": "norm1", "in_layers.2": "conv1", "emb_layers.1": "time_emb_proj"},
     **{"out_layers.0": "norm2", "out_layers.3": "conv2", "skip_connection": "conv_shortcut"},
@@ -56,8 +56,8 @@ CLIP_LAYER = {
 
 
 def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
-    """Sizes and tensors of the four networks, of the U-Net's moving averages or its raw weights; `UserError` for a file
-    that is no checkpoint of Zero123."""
+    """Read configs and tensors of the four networks, with the U-Net's moving averages or raw weights; raises
+    `UserError` if the file is not a Zero123 checkpoint."""
     tensors = read_state_dict(path)
     for key in tensors:
         if not key.startswith((UNET, VAE, VISUAL, PROJECTION)) and not LEFT_OVER.fullmatch(key):
@@ -65,13 +65,13 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
     if weights == "ema" and not any(key.startswith(EMA) for key in tensors):
         raise UserError(f"{path}: holds no moving averages ({EMA}...); use the raw weights with weights=raw")
     try:
-        tensors[f"{PROJECTION}weight"]  # what other models of latent-diffusion lack
+        tensors[f"{PROJECTION}weight"]  # missing in other latent-diffusion models
         configs = {"unet": _unet_sizes(tensors), "vae": _vae_sizes(tensors), "image_encoder": _clip_sizes(tensors)}
         unet, vae, clip, projection = (
             {key.removeprefix(prefix): stored for key, stored in tensors.items() if key.startswith(prefix)}
             for prefix in (UNET, VAE, VISUAL, PROJECTION)
         )
-        if weights == "ema":  # latent-diffusion stores them without dots
+        if weights == "ema":  # latent-diffusion stores their names without dots
             unet = {key: tensors[f"{EMA}diffusion_model{key.replace('.', '')}"] for key in unet}
         return configs, {
             "unet": _renamed(unet, unet_modules(configs["unet"])),
@@ -81,24 +81,24 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
         }
     except KeyError as error:
         raise UserError(f"{path}: is not a Zero123 checkpoint: it holds no '{error.args[0]}'") from error
-    except (IndexError, ValueError) as error:  # tensors of too few or too many dimensions
+    except (IndexError, ValueError) as error:  # tensors with too few or too many dimensions
         raise UserError(f"{path}: is not a Zero123 checkpoint: its tensors have other shapes") from error
 
 
 def _renamed(tensors: Tensors, modules: Mapping[str, str]) -> dict[str, StoredTensor]:
-    """The tensors by their names with the module, the longest that is in the table, as the table has it."""
+    """Rename the tensors, replacing the longest module prefix that is in the table."""
     known = "|".join(re.escape(module) for module in sorted(modules, key=len, reverse=True))
     module = re.compile(rf"^({known})(?=\.|$)")
     return {module.sub(lambda found: modules[found[1]], key): stored for key, stored in tensors.items()}
 
 
 def _numbers(tensors: Tensors, pattern: str) -> list[int]:
-    """The numbers that stand where `pattern` has its group, sorted."""
+    """The sorted numbers matched by the group of `pattern`."""
     return sorted({int(match[1]) for key in tensors if (match := re.match(pattern, key))})
 
 
 def _unet_sizes(tensors: Tensors) -> dict[str, Any]:
-    # Block 0 is the first convolution; a level's residual blocks follow, and a downsampling after all but the last.
+    # Block 0 is the first convolution. Each level's residual blocks follow, with downsampling after all but the last.
     numbers = _numbers(tensors, rf"{UNET}input_blocks\.(\d+)\.0\.")
     layers = next((n - 1 for n in numbers if f"{UNET}input_blocks.{n}.0.op.weight" in tensors), len(numbers) - 1)
     levels = [f"{UNET}input_blocks.{number}" for number in numbers[1 :: layers + 1]]
@@ -107,7 +107,7 @@ def _unet_sizes(tensors: Tensors) -> dict[str, Any]:
         channels,
         layers,
         attention=[f"{level}.1.norm.weight" in tensors for level in levels],
-        heads=min(8, channels[0] // 8),  # they leave no trace: 8, fewer where each would have under 8 channels
+        heads=min(8, channels[0] // 8),  # not stored: 8, or fewer if heads would have under 8 channels
         context=tensors[f"{UNET}middle_block.1.transformer_blocks.0.attn2.to_k.weight"].shape[1],
         latent=tensors[f"{UNET}input_blocks.0.0.weight"].shape[1] // 2,
     )
@@ -128,7 +128,7 @@ def _clip_sizes(tensors: Tensors) -> dict[str, Any]:
 
 
 def _clip_tensors(clip: Tensors) -> dict[str, StoredTensor]:
-    """Queries, keys and values are one tensor in OpenAI's, and the projection is transposed."""
+    """Convert OpenAI's tensors, where queries, keys and values are joint and the projection is transposed."""
     tensors: dict[str, StoredTensor] = {}
     for name, stored in clip.items():
         if name == "proj":
@@ -146,8 +146,8 @@ def _clip_tensors(clip: Tensors) -> dict[str, StoredTensor]:
 
 
 def unet_modules(config: Mapping[str, Any]) -> dict[str, str]:
-    """The U-Net's, whose blocks the training code numbers through all levels: of the way down a level's residual
-    blocks and a downsampling, of the way up one residual block more, and the upsampling inside the last one."""
+    """Table of the U-Net. The training code numbers its blocks across levels: going down, each level's residual blocks
+    and a downsampling; going up, one more residual block, with the upsampling inside the last one."""
     names, layers = dict(UNET_ENDS), config["layers_per_block"]
 
     def resnet(original: str, ours: str) -> None:
@@ -164,13 +164,13 @@ def unet_modules(config: Mapping[str, Any]) -> dict[str, str]:
                 resnet(f"{blocks}_blocks.{first + layer}.0", f"{way}_blocks.{level}.resnets.{layer}")
                 names[f"{blocks}_blocks.{first + layer}.1"] = f"{way}_blocks.{level}.attentions.{layer}"
         names[f"input_blocks.{number + 1 + layers}.0.op"] = f"down_blocks.{level}.downsamplers.0.conv"
-        after = 2 if up.startswith("CrossAttn") else 1  # the residual block, and the attention where there is any
+        after = 2 if up.startswith("CrossAttn") else 1  # after the residual block and, if present, attention
         names[f"output_blocks.{number + layers}.{after}.conv"] = f"up_blocks.{level}.upsamplers.0.conv"
     return names
 
 
 def vae_modules(config: Mapping[str, Any]) -> dict[str, str]:
-    """The autoencoder's; the training code counts the decoder's levels from the other end."""
+    """Table of the autoencoder; the training code counts the decoder's levels in reverse."""
     names: dict[str, str] = {}
     levels, layers = len(config["block_out_channels"]), config["layers_per_block"]
     for side, way, resnets in (("encoder", "down", layers), ("decoder", "up", layers + 1)):
@@ -187,7 +187,7 @@ def vae_modules(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def clip_modules(config: Mapping[str, Any]) -> dict[str, str]:
-    """Those of CLIP's image encoder; queries, keys and values are one module in OpenAI's, and three in ours."""
+    """Table of CLIP's image encoder; queries, keys and values are one module in OpenAI's code and three in ours."""
     names = {original: f"vision_model.{ours}" for original, ours in CLIP_ENDS.items()}
     for layer in range(config["num_hidden_layers"]):
         original, ours = f"transformer.resblocks.{layer}", f"vision_model.encoder.layers.{layer}"

@@ -1,4 +1,4 @@
-"""Zero123 as an energy over relative poses, and as a generator of novel views."""
+"""Zero123 as an energy over relative poses and a generator of novel views."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from lp_framework.priors.zero123.original import Averages
 from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.registry import register
 
-IMAGE_SIZE = 256  # the sizes in the configs of published folders are those of Stable Diffusion, some of them
-STEEPER = 4096  # times the energy is differentiated, lest small slopes vanish in float16; a power of two is exact
-SCALE = 0.18215  # of latents before noise is added; the latent of the source is not scaled
+IMAGE_SIZE = 256  # some configs of published folders have the sizes of Stable Diffusion instead
+STEEPER = 4096  # loss scale that prevents small gradients from vanishing in float16; a power of two is exact
+SCALE = 0.18215  # factor on latents before noise is added; the latent of the source is not scaled
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 
@@ -31,7 +31,7 @@ _Result = TypeVar("_Result")
 def conditioning_vector(pose: Tensor) -> Tensor:
     """T = [-dlatitude, sin dlongitude, cos dlongitude, dradius] `[..., 4]` of relative poses `[..., 3]`.
 
-    Zero123 (section 3.2) counts the polar angle down from the pole, hence the sign of the first entry.
+    Zero123 (section 3.2) measures the polar angle down from the pole, hence the sign of the first entry.
 
     >>> conditioning_vector(torch.tensor([0.2, 0.0, -0.5]))
     tensor([-0.2000,  0.0000,  1.0000, -0.5000])
@@ -41,10 +41,10 @@ def conditioning_vector(pose: Tensor) -> Tensor:
 
 
 class Chunks:
-    """Runs a function on slices of a batch, at most `size` long (None: all of it).
+    """Runs a function on slices of a batch, at most `size` long (None: the whole batch).
 
-    When a GPU runs out of memory, `release` gives back what it can and says whether that was anything; else the size is
-    halved for good. Then the rest of the batch is tried again.
+    When the GPU runs out of memory, `release` frees what it can and returns whether it freed anything. If it did not,
+    `size` is halved permanently. Then the rest of the batch is retried.
     """
 
     def __init__(self, size: int | None, release: Callable[[], bool] | None = None) -> None:
@@ -66,13 +66,13 @@ class Chunks:
             else:
                 start = stop
                 continue
-            torch.cuda.empty_cache()  # here the exception, and with it the tensors of the failed attempt, are gone
+            torch.cuda.empty_cache()  # by now the exception and the failed attempt's tensors are freed
         return results
 
 
 class EnergyAndSlope(torch.autograd.Function):
-    """Energies `[B]` of poses `[B, 3]`, each of its own pose alone, whose gradients `both` computes with them, chunk by
-    chunk; they are kept in the place of the network's activations. Differentiable once; for more use the residual."""
+    """Energies `[B]`, each of its own one of the poses `[B, 3]`. `both` computes their gradients along with them, chunk
+    by chunk, to store these instead of activations. Differentiable once; for higher orders use the residual."""
 
     @staticmethod
     def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
@@ -92,10 +92,10 @@ class EnergyAndSlope(torch.autograd.Function):
 
 
 class Zero123Prior(Prior):
-    """Zero123's four networks, in whatever dtype; poses, their projection and energies are float32 in any case.
+    """Zero123's four networks, in any dtype; poses, their projection and energies are always float32.
 
-    With `cuda_graph` the energy and its gradient are recorded once for each size of a batch and then replayed, which
-    spares the host a thousand launches a step. On a GPU that runs out of memory `max_batch` is halved.
+    With `cuda_graph`, the energy and its gradient are recorded once per batch size and then replayed, which saves a
+    thousand kernel launches per step. If the GPU runs out of memory, `max_batch` is halved.
     """
 
     def __init__(
@@ -112,12 +112,12 @@ class Zero123Prior(Prior):
             raise UserError(f"prior.max_batch must be at least 1, got {max_batch}")
         self.unet, self.vae, self.image_encoder = networks.unet, networks.vae, networks.image_encoder
         self.cc_projection = networks.cc_projection
-        self.cc_projection.float()  # small, and what the pose passes through
+        self.cc_projection.float()  # small, and it processes the pose
         choose_attention(self.unet, attention)
         if channels_last:
             self.unet.to(memory_format=torch.channels_last)
         if compile:
-            # Inductor's own choice of layouts gives wrong gradients (30% off) on CPUs, seen with PyTorch 2.13.
+            # Inductor's layout optimization gives wrong gradients (30% off) on CPUs, seen with PyTorch 2.13.
             self.unet.compile(options={"layout_optimization": False})
         self.eval().requires_grad_(False)
         side = IMAGE_SIZE // 2 ** (len(self.vae.config.block_out_channels) - 1)
@@ -130,12 +130,12 @@ class Zero123Prior(Prior):
         self.num_timesteps = len(self.alphas_cumprod)
 
     def _apply(self, function: Any, recurse: bool = True) -> Any:
-        self.replayed.forget()  # whatever moves or converts a module passes here
+        self.replayed.forget()  # called whenever the module is moved or converted
         return super()._apply(function, recurse)
 
     @torch.no_grad()
     def encode(self, images: Tensor) -> ViewCode:
-        """See `Prior.encode`: the mode of the autoencoder's posterior, unscaled, and CLIP's embedding `[B, 1, 768]`."""
+        """See `Prior.encode`: the unscaled mode of the autoencoder's posterior, and CLIP's embedding `[B, 1, 768]`."""
         images = resized(images, self.image_size)
         parts = self.image_chunks.run(lambda part: self._encode(images[part]), len(images))
         latents, embeddings = zip(*parts, strict=True)
@@ -143,7 +143,7 @@ class Zero123Prior(Prior):
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         latent = self.vae.encode(images.to(self.vae.dtype)).latent_dist.mode().float()
-        # The published code resizes for CLIP by bicubic interpolation with corners aligned, without antialiasing.
+        # The published code resizes for CLIP with bicubic interpolation and aligned corners, without antialiasing.
         side: Any = self.image_encoder.config.image_size
         small = functional.interpolate(images.float(), [side, side], mode="bicubic", align_corners=True)
         pixels = ((small + 1) / 2 - self.clip_mean) / self.clip_std
@@ -152,7 +152,7 @@ class Zero123Prior(Prior):
 
     @torch.no_grad()
     def decode(self, latent: Tensor) -> Tensor:
-        """Images `[B, 3, image_size, image_size]` (not clipped) of unscaled latents `[B, *latent_shape]`."""
+        """Decode unscaled latents `[B, *latent_shape]` to images `[B, 3, image_size, image_size]`, not clipped."""
         parts = self.image_chunks.run(lambda part: self.vae.decode(latent[part].to(self.vae.dtype)).sample, len(latent))
         return torch.cat(parts).float()
 
@@ -175,7 +175,7 @@ class Zero123Prior(Prior):
         return self.predict(noisy, source.latent, self.token(source.embedding, pose), timestep) - noise
 
     def predict(self, noisy: Tensor, condition: Tensor, token: Tensor, timestep: Tensor) -> Tensor:
-        """epsilon_theta `[B, *latent_shape]`, float32, of a chunk: noised latents, the source's latents, tokens."""
+        """epsilon_theta `[B, *latent_shape]` (float32) of a chunk, given noised latents, source latents and tokens."""
         latents = torch.cat([noisy, condition], dim=1).to(self.unet.dtype)
         if self.channels_last:
             latents = latents.contiguous(memory_format=torch.channels_last)
@@ -185,7 +185,7 @@ class Zero123Prior(Prior):
     def denoising_error(
         self, target: ViewCode, source: ViewCode, pose: Tensor, timestep: Tensor, noise: Tensor
     ) -> Tensor:
-        """See `Prior.denoising_error`. A chunk's gradient is taken with its value, so memory is that of one chunk."""
+        """See `Prior.denoising_error`. Gradients are computed with the values, so memory is that of one chunk."""
         self.check(target, source, pose, timestep, noise)
         inputs = pose, target.latent, source.latent, source.embedding, timestep, noise
         if pose.requires_grad and torch.is_grad_enabled():
@@ -198,7 +198,7 @@ class Zero123Prior(Prior):
     def _energy(
         self, pose: Tensor, target: Tensor, source: Tensor, embedding: Tensor, timestep: Tensor, noise: Tensor
     ) -> Tensor:
-        codes = ViewCode(target, embedding), ViewCode(source, embedding)  # a target's embedding is not read
+        codes = ViewCode(target, embedding), ViewCode(source, embedding)  # the target's embedding is unused
         return self._residual(*codes, pose, timestep, noise).square().flatten(1).mean(dim=1)
 
     def _energy_and_slope(self, pose: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
@@ -244,7 +244,7 @@ class Zero123Prior(Prior):
 class Zero123(Zero123Prior):
     """Zero123: `path` is its checkpoint (105000.ckpt), a folder in diffusers' layout, or a Hugging Face id.
 
-    `weights` chooses the moving averages (as iFusion) or the raw weights (as ID-Pose) of a checkpoint file.
+    `weights` selects the moving averages (as in iFusion) or the raw weights (as in ID-Pose) of a checkpoint file.
     """
 
     PUBLISHED = "kxic/zero123-105000"  # a Hugging Face id
@@ -271,6 +271,6 @@ class Zero123(Zero123Prior):
 
 @register("prior", "zero123xl")
 class Zero123XL(Zero123):
-    """Zero123-XL, trained on Objaverse-XL: as `zero123`; its checkpoint is zero123-xl.ckpt."""
+    """Zero123-XL, trained on Objaverse-XL; like `zero123`, with checkpoint zero123-xl.ckpt."""
 
     PUBLISHED = "kxic/zero123-xl"

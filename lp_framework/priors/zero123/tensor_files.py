@@ -1,11 +1,11 @@
-"""Tensors in files of PyTorch and safetensors, mapped one at a time; nothing that a file says is ever run.
+"""Memory-map the tensors in PyTorch and safetensors files one at a time, without executing code from a file.
 
-The libraries' own readers map a whole file, and each page that a tensor was copied from stays in memory until the last
-tensor is done. With a mapping for each tensor the peak is about the weights that are kept.
+The libraries' own readers map a whole file, so every page that was copied stays in memory until the last tensor is
+read. With one mapping per tensor, peak memory is about the size of the weights that are kept.
 
-Published checkpoints mention classes of their training code, callbacks of PyTorch Lightning above all, which
-`torch.load(weights_only=True)` refuses, and without that argument unpickling runs whatever a file names. The unpickler
-here knows tensors and plain containers, and makes empty objects of the training code's; any other name is refused.
+Published checkpoints reference classes of their training code, mostly PyTorch Lightning callbacks.
+`torch.load(weights_only=True)` refuses these, and without that argument unpickling executes whatever a file names. Our
+unpickler supports tensors and plain containers, replaces training code objects by empty ones, and refuses all else.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ STORAGES = {
     **{"ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool},
 }
 
-# Classes of which an empty one stands in. None of this is what keeps a file from running code: no name is looked up.
+# Classes replaced by an empty one. Safety does not depend on this list: names are never looked up.
 STAND_INS = re.compile(
     r"(pytorch_lightning|lightning|lightning_fabric|lightning_utilities|omegaconf|ldm)\..*"
     r"|numpy(\._?core\.multiarray)?\.\w+|torch\.optim(\.lr_scheduler)?\.\w+"
@@ -61,22 +61,22 @@ class StoredTensor:
     stride: tuple[int, ...]
 
     def map(self) -> Tensor:
-        """The tensor, mapped from the file: only the bytes that are looked at take memory, while it lives."""
+        """Memory-map the tensor: only bytes that are read take memory, for its lifetime."""
         if 0 in self.shape:
             return torch.empty(self.shape, dtype=self.dtype)
         mapped = np.memmap(self.path, np.uint8, "c", self.offset, shape=(self.extent(),))
         return torch.from_numpy(mapped).view(self.dtype).as_strided(self.shape, self.stride)
 
     def extent(self) -> int:
-        """Bytes from the first to the last element, those in between included."""
+        """Number of bytes from the first to the last element, including gaps."""
         steps = sum((size - 1) * stride for size, stride in zip(self.shape, self.stride, strict=True))
         return 0 if 0 in self.shape else (1 + steps) * self.dtype.itemsize
 
 
 def read_safetensors(path: Path) -> dict[str, StoredTensor]:
-    """The tensors of a file by name; `UserError` for a file that is no safetensors file or is cut short."""
+    """Read the tensors of a file by name; raises `UserError` if it is not a safetensors file or is truncated."""
     try:
-        with safe_open(path, "pt"), path.open("rb") as file:  # the library sees to it that the header is sound
+        with safe_open(path, "pt"), path.open("rb") as file:  # the library validates the header
             length = int.from_bytes(file.read(8), "little")
             header = json.loads(file.read(length))
         header.pop("__metadata__", None)
@@ -92,8 +92,8 @@ def read_safetensors(path: Path) -> dict[str, StoredTensor]:
 
 
 def read_state_dict(path: Path) -> dict[str, StoredTensor]:
-    """The tensors of a checkpoint's `state_dict`, or of a file that is nothing but one, by name; `UserError` for a file
-    that is missing, not of `torch.save`, damaged, or that would run code when unpickled."""
+    """Read the tensors of a checkpoint's `state_dict`, or of a bare state dict, by name; raises `UserError` for a file
+    that is missing, not written by `torch.save`, damaged, or that would execute code when unpickled."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as file:
             contents = _Unpickler(path, archive, file).load()
@@ -106,7 +106,7 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
             f"{path}: is not a PyTorch checkpoint (a zip archive that torch.save wrote), or is cut short or damaged"
         )
         raise UserError(message) from error
-    except Exception as error:  # a damaged pickle fails in any way
+    except Exception as error:  # a damaged pickle can raise anything
         raise UserError(f"{path}: its description of the tensors is damaged; download it again") from error
     if isinstance(contents, Mapping) and isinstance(contents.get("state_dict"), Mapping):
         contents = contents["state_dict"]
@@ -118,7 +118,7 @@ def read_state_dict(path: Path) -> dict[str, StoredTensor]:
 
 
 class _Storage(NamedTuple):
-    """A storage's record: its first byte in the file, its length in bytes, the type of its elements."""
+    """Location of a storage: first byte in the file, length in bytes, and dtype of the elements."""
 
     start: int
     length: int
@@ -126,7 +126,7 @@ class _Storage(NamedTuple):
 
 
 class _StandIn:
-    """What objects of unknown classes become: takes everything, keeps nothing, does nothing."""
+    """Stand-in for objects of the training code: accepts everything, stores nothing, does nothing."""
 
     def __new__(cls, *arguments: Any, **named: Any) -> _StandIn:
         return super().__new__(cls)
@@ -140,7 +140,7 @@ class _StandIn:
 class _Unpickler(pickle.Unpickler):
     """Reads `NAME/data.pkl` of an archive, where each storage is a record `NAME/data/KEY`.
 
-    `find_class`, by which alone a pickle reaches code, looks nothing up.
+    `find_class`, the only way for a pickle to reach code, never looks up a name.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, file: BinaryIO) -> None:
@@ -151,7 +151,7 @@ class _Unpickler(pickle.Unpickler):
         self.path, self.archive, self.file, self.root = path, archive, file, pickles[0].removesuffix("/data.pkl")
 
     def find_class(self, module: str, name: str) -> Any:
-        module = "builtins" if module == "__builtin__" else module  # as Python 2 and pickle protocol 2 call it
+        module = "builtins" if module == "__builtin__" else module  # its name in Python 2 and pickle protocol 2
         full = f"{module}.{name}"
         if full == "collections.OrderedDict":
             return OrderedDict
@@ -171,13 +171,13 @@ class _Unpickler(pickle.Unpickler):
         _, dtype, key, _, _ = pid  # "storage", type, key, device, number of elements
         info = self.archive.getinfo(f"{self.root}/data/{key}")
         self.file.seek(info.header_offset + 26)
-        start = info.header_offset + 30 + sum(struct.unpack("<HH", self.file.read(4)))  # a name and an extra field
+        start = info.header_offset + 30 + sum(struct.unpack("<HH", self.file.read(4)))  # skip name and extra field
         if info.compress_type != zipfile.ZIP_STORED or start + info.file_size > os.fstat(self.file.fileno()).st_size:
             raise UserError(f"{self.path}: is cut short or damaged; download it again")
         return _Storage(start, info.file_size, dtype)
 
     def _tensor(self, storage: _Storage, offset: int, shape: Any, stride: Any, *rest: Any) -> StoredTensor:
-        """Stands for `torch._utils._rebuild_tensor_v2`; `rest` is requires_grad, hooks and metadata."""
+        """Replaces `torch._utils._rebuild_tensor_v2`; `rest` is requires_grad, hooks and metadata."""
         skipped = offset * storage.dtype.itemsize
         tensor = StoredTensor(self.path, storage.start + skipped, storage.dtype, tuple(shape), tuple(stride))
         if min((offset, *shape, *stride)) < 0 or skipped + tensor.extent() > storage.length:

@@ -1,6 +1,6 @@
-"""Where Zero123's weights come from: a checkpoint of the training code, a diffusers folder, the Hugging Face hub.
+"""Sources of Zero123's weights: a checkpoint of the training code, a diffusers folder, or the Hugging Face hub.
 
-Published folders name the pose projection and its tensors in two ways: `cc_projection` (`projection.weight`) and
+Published folders use two names for the pose projection and its tensors: `cc_projection` (`projection.weight`) and
 `clip_camera_projection` (`proj.weight`).
 """
 
@@ -19,7 +19,7 @@ from lp_framework.priors.zero123.original import Averages, read_original
 from lp_framework.priors.zero123.tensor_files import StoredTensor, read_safetensors, read_state_dict
 
 PARTS, PROJECTIONS = ("unet", "vae", "image_encoder"), ("cc_projection", "clip_camera_projection")
-WEIGHT_FILES = [  # of diffusers and of transformers, best first
+WEIGHT_FILES = [  # of diffusers and transformers, in order of preference
     f"{stem}{variant}.{suffix}"
     for suffix in ("safetensors", "safetensors.index.json", "bin")
     for variant in ("", ".fp16")
@@ -31,8 +31,8 @@ HUB_ID = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*")
 
 
 def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dtype) -> Networks:
-    """The networks of an original checkpoint file, of a folder in diffusers' layout, or of a hub id `owner/name`;
-    `UserError` where the weights cannot be had or do not fit."""
+    """Load the networks from an original checkpoint file, a folder in diffusers' layout, or a hub id `owner/name`;
+    raises `UserError` if the weights are unavailable or do not fit."""
     packages()
     place = Path(path)
     if not place.exists() and HUB_ID.fullmatch(path) and place.suffix not in (".ckpt", ".pt", ".pth"):
@@ -52,9 +52,9 @@ def load_networks(path: str, revision: str | None, weights: Averages, dtype: Dty
 
 
 def download(hub_id: str, revision: str | None) -> Path:
-    """The local folder of a hub repository: of each network its config and the best file of its weights.
+    """Download the config and the preferred weights file of each network; returns the local folder.
 
-    Without an answer, what has been downloaded before is used; `UserError` where there is none.
+    If the hub does not respond, an earlier download is used; raises `UserError` if there is none.
     """
     from huggingface_hub import HfApi, snapshot_download
 
@@ -65,7 +65,7 @@ def download(hub_id: str, revision: str | None) -> Path:
             shards = [f"{part}/*.safetensors"] if best and best[0].endswith(".index.json") else []
             needed += [f"{part}/config.json", *best[:1], *shards]
         folder = snapshot_download(hub_id, revision=revision, allow_patterns=needed)
-    except Exception as error:  # each HTTP library that the hub's package has used tells it its own way
+    except Exception as error:  # the hub's package has used several HTTP libraries, each with its own errors
         try:
             folder = snapshot_download(hub_id, revision=revision, local_files_only=True)
         except Exception:
@@ -78,7 +78,7 @@ def download(hub_id: str, revision: str | None) -> Path:
 
 
 def read_folder(path: Path) -> tuple[Configs, Weights]:
-    """Sizes and tensors of the four networks of a folder; `UserError` where a file is missing or cannot be read."""
+    """Read configs and tensors of the four networks in a folder; `UserError` if a file is missing or unreadable."""
     projection = next((path / name for name in PROJECTIONS if (path / name).is_dir()), None)
     if projection is None:
         raise UserError(f"{path}: holds no pose projection, a folder {' or '.join(PROJECTIONS)}")
@@ -96,7 +96,7 @@ def _weights(folder: Path) -> dict[str, StoredTensor]:
         raise UserError(f"{folder}: holds no weights; looked for {', '.join(WEIGHT_FILES)}")
     read = read_state_dict if file.suffix == ".bin" else read_safetensors
     files = [file]
-    if file.suffix == ".json":  # the index of weights in several files
+    if file.suffix == ".json":  # the index of sharded weights
         with expecting(f"{file}: names no files of weights; download it again"):
             files = [file.with_name(name) for name in sorted({*read_json(file)["weight_map"].values()})]
     tensors = {name: stored for each in files for name, stored in read(each).items()}
@@ -104,7 +104,7 @@ def _weights(folder: Path) -> dict[str, StoredTensor]:
 
 
 def write_folder(networks: Networks, path: Path) -> None:
-    """Write the networks as safetensors in diffusers' layout (`cc_projection`), whole or not at all (`UserError`)."""
+    """Write the networks atomically as safetensors in diffusers' layout (`cc_projection`); `UserError` on failure."""
     projection = networks.cc_projection
     sizes = {"in_channel": projection.in_features, "out_channel": projection.out_features}
     tensors = {f"projection.{name}": tensor for name, tensor in projection.state_dict().items()}
