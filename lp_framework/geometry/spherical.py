@@ -94,7 +94,7 @@ def level_camera(pose: Tensor, direction: Tensor) -> Tensor:
     aside = torch.hypot(x, y)
     axis = torch.stack([-y, x, torch.zeros_like(x)], dim=-1) / aside.clamp(min=torch.finfo(x.dtype).tiny)[..., None]
     turn = so3_exp(axis * torch.atan2(aside, -z)[..., None])  # the smallest rotation of `direction` to straight ahead
-    right, up, back = turn[..., 0].unbind(-1)  # where it takes the +X axis, which is horizontal after this roll:
+    right, up, back = turn[..., 0].unbind(-1)  # the rotated +X axis, made horizontal by the roll below
     sine = -pose[..., 0].tan() * back / torch.hypot(right, up)
     roll = torch.asin(sine.clamp(-1, 1)) - torch.atan2(up, right)
     ahead = camera_to_world(pose)

@@ -108,7 +108,7 @@ def _read_folder(folder: Path) -> dict[str, Any]:
 
 
 def write_model_folder(checkpoint: dict[str, Any], run: Path, folder: Path, dtype: torch.dtype) -> None:
-    """Atomically write a checkpoint of the run in `run`, with floating-point weights as `dtype` (or `UserError`)."""
+    """Write a checkpoint of the run in `run` atomically, floating-point weights as `dtype`; `UserError` on failure."""
     weights = {
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous()
         for key, tensor in checkpoint["state_dict"].items()

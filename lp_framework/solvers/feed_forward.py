@@ -70,7 +70,7 @@ def with_weights(load: Callable[[str], Loaded], network: str, weights: str) -> L
 class FeedForward(RelativeCameraSolver):
     """A network that predicts both cameras of a pair, reference first, in any frame and at any scale.
 
-    The whole square image is resized to `image_size` pixels a side, a multiple of the network's `patch`.
+    Square images are resized to side length `image_size` in pixels, a multiple of the network's `patch`.
     """
 
     patch: int
@@ -84,7 +84,7 @@ class FeedForward(RelativeCameraSolver):
 
     @abstractmethod
     def cameras(self, images: Tensor) -> Tensor:
-        """Camera-to-world matrices `[2, 4, 4]` (OpenCV axes; NaN: no answer) of prepared images `[2, 3, H, W]`."""
+        """Camera-to-world `[2, 4, 4]` (OpenCV axes; NaN: no answer) of prepared images `[2, 3, H, W]` in [-1, 1]."""
 
     def prepare(self, images: Tensor) -> Tensor:
         """Resize images `[I, 3, H, W]` in [-1, 1] to the network's size, with Pillow's resampling."""

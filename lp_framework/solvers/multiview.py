@@ -125,7 +125,7 @@ class MultiView(Solver):
         return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
     def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """2. Fit poses to the measurements: one answer per set `[S, 1, V - 1, 3]`, and its validity `[S, 1]`."""
+        """2. Robust fit: one answer per set `[S, 1, V - 1, 3]`, valid `[S, 1]` if every image has measurements."""
         poses = fit_views(measured, weights)[:, None, 1:].to(measured)
         known = (weights > 0).any(dim=-1)
         return poses, (known | known.mT).any(dim=-1).all(dim=-1, keepdim=True)

@@ -59,7 +59,7 @@ def _stars(measured: Tensor, weights: Tensor) -> Tensor:
 
 
 def _residual(poses: Tensor, measured: Tensor) -> Tensor:
-    """Residuals `[S, C, V, V, K, 3]` (wrapped longitudes) of poses `[S, C, V, 3]`; measured is `[S, 1, V, V, K, 3]`."""
+    """Residuals `[S, C, V, V, K, 3]` (wrapped longitudes) of poses `[S, C, V, 3]`, `measured` `[S, 1, V, V, K, 3]`."""
     latitude, longitude, radius = (poses[..., None, :, None, :] - poses[..., :, None, None, :] - measured).unbind(-1)
     return torch.stack([latitude, wrap_angle(longitude), radius], dim=-1)
 

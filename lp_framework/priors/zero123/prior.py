@@ -71,8 +71,8 @@ class Chunks:
 
 
 class EnergyAndSlope(torch.autograd.Function):
-    """Energies `[B]`, each of its own one of the poses `[B, 3]`. `both` computes their gradients along with them, chunk
-    by chunk, to store these instead of activations. Differentiable once; for higher orders use the residual."""
+    """Energies `[B]` of poses `[B, 3]`, each depending only on its own pose. `both` also computes the gradients, chunk
+    by chunk, and these are stored instead of activations. Differentiable once; for higher orders use the residual."""
 
     @staticmethod
     def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
