@@ -1,4 +1,4 @@
-"""Local feature matching and the essential matrix: the classical baseline, without a prior or a model."""
+"""Local feature matching and the essential matrix: a baseline that needs neither a prior nor a model."""
 
 from __future__ import annotations
 

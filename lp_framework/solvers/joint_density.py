@@ -19,7 +19,7 @@ from lp_framework.models.pose_density import GRID, PoseDensity
 
 HYPOTHESES = 64
 SWEEPS = 10  # coordinate ascent over all views: each moves to its best longitude given the others
-DEPENDENCE = 0.7  # at 1 all V - 1 pairs together count as one; at 0 they count as independent
+DEPENDENCE = 0.7  # at 0, V - 1 pairs count as independent; at 1, together as one
 _TREES = 0x4A4F  # makes these draws independent of others under the same seed
 
 
