@@ -1,1 +1,1 @@
-"""What is computed in order to be looked at: landscapes, fields, pairs with all that explains them."""
+"""Computations behind the figures: energy landscapes, fields, and pairs with their explanations."""

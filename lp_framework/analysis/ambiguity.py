@@ -1,7 +1,7 @@
-"""How well a prior's energy singles out the azimuth of an object, and how far its views leave it open.
+"""How well a prior's energy identifies the azimuth of an object, and how ambiguous its views leave it.
 
-The *valley floor* is the lowest ground at each longitude, in the range of its landscape; its mean over pairs, each
-turned so that the truth is at 0, is what the object itself has of valleys.
+The *valley floor* is the lowest energy at each longitude, relative to the range of its landscape. Its mean over pairs,
+each rotated so that the truth is at 0, shows the valleys of the object itself.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, pairs_of
 
 NEAR_DEGREES = 15.0
-PROMINENCE = 0.1  # of a profile's range; a shallower dent is no minimum
+PROMINENCE = 0.1  # of a profile's range; shallower dips do not count as minima
 EQUAL = 0.05  # of the floor's range; valleys whose depths differ by less are equally good answers
-HALF_TURN = 30.0  # degrees; so far from 180 a second valley may lie to be one of the other side
-PAIRS = 8  # an object, for its ambiguity
+HALF_TURN = 30.0  # degrees; tolerance around 180 for a second valley to count as half a turn away
+PAIRS = 8  # per object, to compute its ambiguity
 
 Verdict = Literal["unique", "twofold", "several", "continuous"]
 
@@ -39,7 +39,7 @@ def azimuth_energies(prior: Prior, pairs: Pairs, poses: Tensor, azimuths: Tensor
 
 
 def within(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Tensor:
-    """Whether the azimuth of least energy is within `NEAR_DEGREES` of the truth, `[P]`."""
+    """Whether the azimuth of lowest energy is within `NEAR_DEGREES` of the truth, `[P]`."""
     best = azimuths[energies.argmin(dim=1)]
     return wrap_angle(best - truth).abs() <= math.radians(NEAR_DEGREES)
 
@@ -52,17 +52,17 @@ class Profile(NamedTuple):
 
     @property
     def relief(self) -> float:
-        """Its range over its mean: next to 0 where the energy does not tell the azimuth."""
+        """Range divided by mean: close to 0 if the energy does not depend on the azimuth."""
         return ((self.energy.max() - self.energy.min()) / self.energy.mean()).item()
 
     def minima(self) -> list[dict[str, float]]:
-        """Its local minima, the deepest first: `degrees` from the truth, and `height` in the profile's range."""
+        """Local minima, deepest first: `degrees` from the truth, and `height` within the profile's range."""
         found = valleys(self.energy[None], PROMINENCE)
         return [{"degrees": self.degrees[cell].item(), "height": height} for cell, height, _ in found]
 
 
 def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:
-    """The profile of pairs: `energies` `[P, A]` at evenly spaced `azimuths` `[A]`, by distance from `truth` `[P]`."""
+    """Average `energies` `[P, A]` at evenly spaced `azimuths` `[A]` by their distance from `truth` `[P]`."""
     count = len(azimuths)
     offset = wrap_angle(azimuths - truth[:, None])
     place = (offset / (2 * math.pi / count)).round().long() % count
@@ -74,9 +74,9 @@ def profile(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Profile:
 
 
 class Ambiguity(NamedTuple):
-    """An object's ambiguity: `flatness`, 1 less the range of the `floor`, is 1 where all longitudes are equally good.
+    """An object's ambiguity. `flatness`, 1 minus the range of the `floor`, is 1 if all longitudes are equally good.
 
-    `floor` is the mean valley floor over degrees from the truth, `minima` the mean number of a pair's whole landscape.
+    `floor` is the mean valley floor over degrees from the truth; `minima` is the mean number of minima per landscape.
     """
 
     flatness: float
@@ -85,7 +85,7 @@ class Ambiguity(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """`continuous`: the floor is flat. Else by its valleys: one, a second one half a turn away, or other ones."""
+        """`continuous` if the floor is flat; else by its valleys: one, two half a turn apart, or any others."""
         if self.flatness >= FLAT:
             return "continuous"
         places = [minimum["degrees"] for minimum in self.floor.minima()]
@@ -96,11 +96,11 @@ class Ambiguity(NamedTuple):
 
     @property
     def unique_answer(self) -> bool:
-        """Whether one longitude is better than all others: the floor is not flat, and its valleys differ in depth."""
+        """Whether one longitude is best: the floor is not flat, and no other valley is as deep as the deepest."""
         return self.verdict != "continuous" and sum(each["height"] < EQUAL for each in self.floor.minima()) == 1
 
     def record(self) -> dict[str, object]:
-        """As plain values."""
+        """Return plain values."""
         return {
             "verdict": self.verdict,
             "unique_answer": self.unique_answer,
@@ -111,7 +111,7 @@ class Ambiguity(NamedTuple):
 
 
 def ambiguity(landscapes: Sequence[Landscape], truth: Tensor) -> Ambiguity:
-    """The ambiguity of an object, of some pairs' landscapes on one grid and their true relative longitudes `[P]`."""
+    """Ambiguity of an object, from landscapes of P pairs on one grid and their true relative longitudes `[P]`."""
     floors = torch.stack([landscape.floor() for landscape in landscapes]).double()
     floor = profile(floors, landscapes[0].longitude.double(), truth.double())
     minima = sum(len(landscape.minima()) for landscape in landscapes) / len(landscapes)
@@ -121,10 +121,10 @@ def ambiguity(landscapes: Sequence[Landscape], truth: Tensor) -> Ambiguity:
 def overview(
     data: PairDataModule, prior: Prior, device: torch.device, draws: Draws, grid: Grid, azimuths: int, protocol: str
 ) -> dict[str, Any]:
-    """`objects`, a row an object, and the shares of pairs whose least energy is at the truth, as plain values.
+    """One row per object (`objects`), and the share of pairs whose lowest energy is at the truth, as plain values.
 
-    `azimuths` are tried around each pair of the protocol, on which the data evaluate; the ambiguity is by landscapes
-    over `grid` of up to `PAIRS` pairs of the protocol `per_view`.
+    Each pair of `protocol` is evaluated at this many `azimuths`. The ambiguity comes from landscapes over `grid` of up
+    to `PAIRS` pairs of the protocol `per_view`.
     """
     split = data.evaluation_split()
     table, views = data.table(split), data.data(split)
@@ -136,7 +136,7 @@ def overview(
         true = batch.relative_poses()
         energy = azimuth_energies(prior, pairs_of(batch, device), true.to(device), places, draws).cpu()
         curve, near = profile(energy, places, true[:, 1]), within(energy, places, true[:, 1])
-        batch = views[per_view[table.views_of(number)[:PAIRS]]]  # a row a view
+        batch = views[per_view[table.views_of(number)[:PAIRS]]]  # one row per view
         true = batch.relative_poses()
         landscapes = prior_landscapes(prior, pairs_of(batch, device), true[:, 2], grid, draws)
         rows.append(

@@ -1,7 +1,7 @@
-"""What an answer is worth, for people: how probable it is, what else the pair may mean, and whether to trust it.
+"""How reliable an answer is: its probability, a second plausible answer, and a verdict in words.
 
-Models with a density tell a probability. A prior tells by its denoising error whether it knows such objects at all; an
-answer in a wrong valley of an object that it knows may still have a low one.
+Models with a density give a probability. For a prior, the denoising error shows whether it knows such objects at all;
+a wrong local minimum of a familiar object may still have a low error.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solution
 from lp_framework.solvers.pair_energy import PairEnergy
 
-TIMESTEPS, NOISES = range(50, 1000, 100), 2  # thousandths of a prior's timesteps, and noises at each, for its error
-FAMILIAR, STRANGE = 2.0, 3.0  # times a prior's usual error up to which an answer is to be trusted, or only doubtful
+TIMESTEPS, NOISES = range(50, 1000, 100), 2  # in thousandths of the prior's timesteps; noises per timestep
+FAMILIAR, STRANGE = 2.0, 3.0  # multiples of the usual error: upper limits for `trust` and `doubtful`
 NEAR_DEGREES = 30.0  # of `Solution.probability`
-TRUST, DOUBT = 0.8, 0.5  # probabilities from which an answer is to be trusted, and from which it is only doubtful
-WORTH_TELLING = 0.05  # probability of a second answer
+TRUST, DOUBT = 0.8, 0.5  # lowest probabilities for `trust` and for `doubtful`
+WORTH_TELLING = 0.05  # lowest probability at which a second answer is reported
 
 
 class Answer(NamedTuple):
-    """The answer to a pair and, if any, a second one: latitude and longitude (radians), relative to the reference, and
-    the probability that the true rotation is within 30 degrees of it, NaN where no model told one; then `strangeness`
-    is the prior's denoising error in units of its usual one."""
+    """The answer to a pair: latitude and longitude relative to the reference (radians), the `probability` that the true
+    rotation is within 30 degrees of it (NaN without a density model), and a `second` answer, if any. `strangeness` is
+    the prior's denoising error divided by its usual error."""
 
     latitude: float
     longitude: float
@@ -37,12 +37,12 @@ class Answer(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Where the camera goes from the reference's place; see `in_words`."""
+        """How the camera moves from the reference; see `in_words`."""
         return in_words(self.latitude, self.longitude)
 
     @property
     def verdict(self) -> str:
-        """`trust`, `doubtful` or `do not trust`; nothing where no pose was found or nothing is known."""
+        """`trust`, `doubtful` or `do not trust`; empty if no pose was found or nothing is known."""
         if math.isfinite(self.probability):
             grade = (self.probability < TRUST) + (self.probability < DOUBT)
         elif math.isfinite(self.strangeness):
@@ -53,14 +53,14 @@ class Answer(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """What the verdict rests on."""
+        """Why the verdict was given."""
         if math.isfinite(self.probability):
             return f"probability {self.probability:.2f} to be within {NEAR_DEGREES:.0f}\N{DEGREE SIGN}"
         return f"denoising error {self.strangeness:.1f} times what it is for objects that the prior knows"
 
     @property
     def second_words(self) -> str:
-        """The second answer, and how it may come about; nothing where there is none."""
+        """The second answer and its likely cause; empty if there is none."""
         if self.second is None:
             return ""
         turn = abs(math.degrees(_turn(self.second.longitude - self.longitude)))
@@ -69,15 +69,15 @@ class Answer(NamedTuple):
 
 
 def answers(solution: Solution | None) -> list[Answer]:
-    """The answer to every pair, with the most probable end that shares no rotation within 30 degrees with it as the
-    second one; an empty list where no model told a probability."""
+    """The answer to every pair. The second answer is the most probable end whose rotations within 30 degrees do not
+    overlap the first one's. Empty if no model gave a probability."""
     if solution is None or solution.probability is None:
         return []
     found = []
     for poses, shares, first in zip(
         solution.poses.detach().cpu(), solution.probability.detach().cpu(), solution.chosen.tolist(), strict=True
     ):
-        # The angles of latitude and longitude together, which those of the rotations do not exceed.
+        # The combined angle of latitude and longitude is an upper bound on the rotation angle.
         angles = torch.hypot(poses[:, 0] - poses[first, 0], wrap_angle(poses[:, 1] - poses[first, 1]))
         apart = angles > math.radians(2 * NEAR_DEGREES)
         other = int(shares.masked_fill(~apart, -1.0).nan_to_num(nan=-1.0).argmax())
@@ -87,7 +87,7 @@ def answers(solution: Solution | None) -> list[Answer]:
 
 
 def answers_by_prior(prior: Prior, pairs: Pairs, poses: Tensor) -> list[Answer]:
-    """Answers `poses` `[B, 3]` to pairs with their strangeness to the prior; empty where its usual error is unknown."""
+    """Answers for `poses` `[B, 3]` with their strangeness to the prior; empty if its usual error is unknown."""
     if prior.usual_error is None:
         return []
     strangeness = (denoising_errors(prior, pairs, poses) / prior.usual_error).tolist()
@@ -109,7 +109,7 @@ def denoising_errors(prior: Prior, pairs: Pairs, poses: Tensor) -> Tensor:
 
 
 def in_words(latitude: float, longitude: float) -> str:
-    """A relative pose (radians), as a camera moves that looks at the object: its longitude grows to the right.
+    """Describe a relative pose (radians) as a motion of the camera facing the object; longitude grows to the right.
 
     >>> in_words(math.radians(10), math.radians(330)), in_words(0.0, math.pi), in_words(0.0, 0.001)
     ('30° to the left, 10° up', '180° round', 'the same viewpoint')
@@ -128,5 +128,5 @@ def _answer(pose: Tensor, probability: Tensor) -> Answer:
 
 
 def _turn(longitude: float) -> float:
-    """The same angle in [-pi, pi]."""
+    """Wrap an angle to [-pi, pi]."""
     return math.remainder(longitude, 2 * math.pi)

@@ -1,4 +1,4 @@
-"""The cameras of photographs of one object, with all that tells how they were found and what they are worth."""
+"""Estimate the cameras of photographs of one object, and record how they were found and how reliable they are."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from lp_framework.solvers.starts import Starts
 
 @dataclass(frozen=True)
 class Estimate:
-    """The cameras of I photographs: their `absolute` view poses and those `relative` to the first, `[I, 3]` each
-    (radians and object sizes, float64, on the CPU; NaN where none was found), at `field_of_view_degrees`.
+    """The cameras of I photographs: `absolute` view poses and poses `relative` to the first, `[I, 3]` each
+    (radians and object sizes, float64, on the CPU; NaN if none was found), at `field_of_view_degrees`.
 
-    `energies` `[I, I]` are the solver's of the ordered pairs; `valid` says that every pose is sound. `answers` say of
-    each photograph but the first what its pose is worth; empty where nothing tells it. `radius_lost`: the crop to the
-    object loses the distance, and nothing estimates it. `shown` are the `pairs` of the first photograph and each other.
+    `energies` `[I, I]` are the solver's, of the ordered pairs; `valid` is whether all poses are valid. `answers` rate
+    the pose of each photograph but the first; empty if unknown. `radius_lost`: the crop to the object loses the
+    distance, and nothing estimates it. `shown` are the `pairs` of the first photograph with each other one.
     """
 
     photographs: Sequence[Photograph]
@@ -45,7 +45,7 @@ class Estimate:
 
     @property
     def files(self) -> list[Path]:
-        """The photographs' files."""
+        """The files of the photographs."""
         return [Path(each.name) for each in self.photographs]
 
 
@@ -53,9 +53,9 @@ def estimate(
     photographs: Sequence[Photograph], crop: bool, solver: Solver, starts: Starts, prior: Prior | None,
     first: Tensor, device: torch.device, seed: int,
 ) -> Estimate:  # fmt: skip
-    """The cameras of two or more photographs, of which the first has the view pose `first` `[3]`.
+    """Estimate the cameras of two or more photographs. The first photograph has the view pose `first` `[3]`.
 
-    Where no model tells how probable an answer is, `prior`, the solver's, tells how strange the object is to it.
+    If no model gives probabilities, the solver's `prior` measures how unfamiliar the object is.
     """
     prepared = [each.prepared(crop) for each in photographs]
     images = [each.image for each in prepared]

@@ -1,9 +1,9 @@
-"""Examples of an evaluation: a few of its pairs with all that explains their answers, failures first, kept on disk.
+"""Examples of an evaluation: a few of its pairs, failures first, saved with what explains their answers.
 
     <folder>/examples.json          poses, starts, trajectories, errors and landscapes
     <folder>/0_reference.png ...    both images of each pair
 
-They are gathered while the solver is at hand; what is drawn of them later needs neither models nor data.
+They are gathered while the solver is loaded, so that drawing them later needs neither models nor data.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.langevin import Langevin
 
-EXAMPLES, FILE = "examples", "examples.json"  # the folder among the pictures, and the file in it
+EXAMPLES, FILE = "examples", "examples.json"  # the folder inside that of the pictures, and its file
 MOST = 6
-SIDE = 192  # pixels of an image that is kept
+SIDE = 192  # pixels per side of a saved image
 TIMESTEPS = (100, 300, 500, 700, 900)
-# A prior's landscapes may take half a minute, or this share of the time that the solver took for all pairs.
+# A prior's landscapes may take half a minute, or this share of the solver's total time.
 SECONDS, SHARE = 30.0, 0.1
 ABOUT = (
     "Poses are (latitude, longitude, radius) in radians and object sizes; relative ones are query minus reference. "
@@ -56,10 +56,10 @@ ARRAYS = ("truth", "starts", "trajectories", "ends", "energies", "rotation_error
 
 
 def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
-    """After `Trainer.test`: up to `MOST` pairs, the largest error first, solved again to see their trajectories.
+    """After `Trainer.test`, solve up to `MOST` pairs again for their trajectories, largest error first.
 
-    Starts and draws are the evaluation's, so the answers are its answers; the errors are those that it counted. Pairs
-    of sets of images, whose answers came of all images of a set, are not solved again and have no maps.
+    Starts and draws are the evaluation's, so the answers are the same; the errors are taken from the evaluation. Pairs
+    of image sets are not solved again and have no maps, since their answers depend on the whole set.
     """
     evaluation.eval()
     rows, table, seed = evaluation.metrics.rows(), evaluation.table, evaluation.seed
@@ -94,7 +94,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
 
 
 def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
-    """Whether the prior's landscapes of so many pairs take little time, by what the evaluation's own passes took."""
+    """Whether the prior's landscapes of `pairs` pairs are quick to compute, judged by the evaluation's own passes."""
     cost = evaluation.metrics.compute()
     seconds, before = (cost["pairs"] * cost[f"{what}_per_pair"] for what in ("seconds", "network_passes"))
     latitude, longitude = landscape_grid()
@@ -105,11 +105,11 @@ def _is_quick(evaluation: Evaluation, pairs: int, draws: Draws) -> bool:
 def pick_examples(
     errors: NDArray, objects: NDArray, names: Sequence[str], unique_answer: Sequence[bool | None]
 ) -> dict[int, str]:
-    """Rows of up to `MOST` pairs of rotation `errors` `[P]` and `objects` `[P]` (indices), and why they are shown.
+    """Pick up to `MOST` rows by rotation `errors` `[P]` and `objects` `[P]` (indices), each with the reason.
 
-    The worst, the median and the best among objects with a unique answer (among all where none is labelled so), and
-    the median among those without one; then the worst of each object that is not among these, objects with a unique
-    answer first: a failure there is the solver's. The largest error comes first, and ties go to the earlier row.
+    Picks the worst, median and best among objects with a unique answer (among all if none is labelled so), and the
+    median among those without; then the worst of each remaining object, objects with a unique answer first, because
+    their failures are the solver's. Rows are sorted by decreasing error; ties go to the earlier row.
     """
     failed = np.nan_to_num(errors, nan=np.inf)
     order, worst_first = (np.argsort(each, kind="stable").tolist() for each in (failed, -failed))
@@ -133,7 +133,7 @@ def pick_examples(
 
 
 def save_examples(folder: Path, examples: Sequence[ShownPair]) -> None:
-    """Write the examples into `folder`, anew; the JSON file is written last."""
+    """Replace the examples in `folder`; the JSON file is written last."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for number, example in enumerate(examples):
@@ -146,7 +146,7 @@ def save_examples(folder: Path, examples: Sequence[ShownPair]) -> None:
 
 
 def read_examples(folder: Path) -> list[ShownPair]:
-    """The examples in `folder`; what is missing or damaged raises as `open`, `json` and Pillow do."""
+    """Read the examples in `folder`; missing or damaged files raise as in `open`, `json` and Pillow."""
     content = json.loads((folder / FILE).read_text(encoding="utf-8"))
     return [_example(folder, number, entry) for number, entry in enumerate(content["examples"])]
 
@@ -191,7 +191,7 @@ def _example(folder: Path, number: int, entry: Mapping[str, Any]) -> ShownPair:
 
 
 def _numbers(values: NDArray | None) -> Any:
-    """Nested lists of numbers to six digits, null for what is not finite."""
+    """Nested lists of numbers to six digits; null if not finite."""
     if values is None:
         return None
     rounded = np.vectorize(lambda value: float(f"{value:.6g}") if np.isfinite(value) else None, otypes=[object])
@@ -199,5 +199,5 @@ def _numbers(values: NDArray | None) -> Any:
 
 
 def _array(values: Any) -> NDArray:
-    """The array of nested lists, NaN for null."""
+    """The array of nested lists; null becomes NaN."""
     return np.array(values, dtype=float)

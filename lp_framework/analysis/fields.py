@@ -1,4 +1,4 @@
-"""Over relative poses: a prior's energies, scores and views, a model's fields, and those of the kernel it learns."""
+"""Functions of the relative pose: a prior's energies, scores and views, a model's fields, and its kernel's fields."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from lp_framework.solvers.base import Pairs
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
 
-GRADIENT_BATCH = 8  # poses whose gradients are taken at once
+GRADIENT_BATCH = 8  # poses per gradient computation
 
 
 class Draws(NamedTuple):
-    """Over what a prior's energy is the mean: `noises` at each of `timesteps`, keyed by `seed`, in both directions.
+    """Random draws that a prior's energy averages: `noises` at each of `timesteps`, keyed by `seed`, both directions.
 
-    The noises are the same at all poses. No more than `batch` poses pass the prior at once, two samples each.
+    All poses get the same noises. At most `batch` poses pass through the prior at once, two samples each.
     """
 
     timesteps: Sequence[int]
@@ -49,7 +49,7 @@ class Draws(NamedTuple):
 
 
 def checked_draws(timesteps: object, noises: object, seed: int, batch: object = 64) -> Draws:
-    """Draws by settings; `UserError` for those that are none. Which timesteps there are a prior says itself."""
+    """Build `Draws` from settings; `UserError` if they are invalid. The prior itself checks the range of timesteps."""
     for key, value in (("noises", noises), ("batch", batch)):
         if not isinstance(value, int) or value < 1:
             raise UserError(f"{key} must be a whole number, at least 1, got {value}")
@@ -60,7 +60,7 @@ def checked_draws(timesteps: object, noises: object, seed: int, batch: object = 
 
 
 class ExactModel(nn.Module):
-    """Stands in for a model of P pairs: the kernel's own score around their truths `[P, 3]`, the best to be learnt."""
+    """Oracle model of P pairs: the kernel's own score around their truths `[P, 3]`, the target of training."""
 
     def __init__(self, kernel: PoseKernel, truth: Tensor, has_energy: bool = False) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class ExactModel(nn.Module):
         self.choose_by, self.has_density = PoseModel.choose_by, False
 
     def encode(self, images: Tensor) -> Tensor:
-        """No features are needed: `[I, 1]`."""
+        """Placeholder features `[I, 1]`."""
         return images.new_zeros(len(images), 1)
 
     def condition(self, reference: Tensor, query: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ class ExactModel(nn.Module):
         return FieldValue(self.kernel.score(pose, truth), energy)
 
     def probability(self, condition: Tensor, pose: Tensor) -> None:
-        """See `PoseModel`: it has no density."""
+        """See `PoseModel`; there is no density."""
 
 
 def grid_poses(radius: Tensor, latitude: Tensor, longitude: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ def prior_landscapes(prior: Prior, pairs: Pairs, radius: Tensor, grid: Grid, dra
 
 @torch.no_grad()
 def pose_energies(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Tensor:
-    """A prior's energies `[B, N]` of relative poses `[B, N, 3]`; a bar shows the progress inside `shown_progress`."""
+    """A prior's energies `[B, N]` of relative poses `[B, N, 3]`; shows a progress bar inside `shown_progress`."""
     steps, codes = draws.steps(), prior.encode(pairs.images)
     # Several pairs at once, or some poses of one pair.
     groups = torch.arange(len(pairs), device=poses.device).split(max(1, draws.batch // poses.shape[1]))
@@ -119,7 +119,7 @@ def pose_energies(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Te
 
 
 def prior_field(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> FieldValue:
-    """A prior's field at relative poses `[B, N, 3]`: minus the gradient of `pose_energies`, and these energies."""
+    """A prior's field at relative poses `[B, N, 3]`: `pose_energies` and their negative gradients."""
     energy, steps = PairEnergy(prior, pairs, draws.seed), draws.steps()
     noise = energy.noise(0, count=len(steps))
     parts = poses.split(max(1, min(draws.batch, GRADIENT_BATCH) // len(pairs)), dim=1)
@@ -128,7 +128,7 @@ def prior_field(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Fiel
         variable = parts[number].detach().clone().requires_grad_()
         gradient = torch.zeros_like(variable)
         total = torch.zeros(variable.shape[:2], device=variable.device)
-        for place, timestep in enumerate(steps):  # a graph of one at a time is kept
+        for place, timestep in enumerate(steps):  # keeps one graph in memory at a time
             with torch.enable_grad():
                 value = energy(variable, timestep, noise[:, place])
                 gradient += torch.autograd.grad(value.sum(), variable)[0]
@@ -143,7 +143,7 @@ def generated_views(
     prior: Prior, source: ViewCode, poses: Tensor, steps: int, guidance: float, seed: int,
     eta: float = 1.0, batch: int = 16,
 ) -> NDArray:  # fmt: skip
-    """Views `[N, H, W, 3]` in [0, 1] of one image's code under relative poses `[N, 3]`, by DDIM with the same draws."""
+    """Views `[N, H, W, 3]` in [0, 1] from one image's code at relative poses `[N, 3]`, by DDIM with shared draws."""
     parts = []
     for number in steps_of(math.ceil(len(poses) / batch), "generated views"):
         generator = torch.Generator().manual_seed(seed)  # on the CPU: a GPU gets the same draws
@@ -157,9 +157,9 @@ def generated_views(
 def model_field(
     model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid, sigma: float | None = None
 ) -> FieldValue:
-    """A model's scores `[B, A, O, 3]` and, of an energy model, energies `[B, A, O]`, at relative radii `[B]`.
+    """A model's scores `[B, A, O, 3]` and, for an energy model, energies `[B, A, O]`, at relative radii `[B]`.
 
-    They are at the model's own `sigma`, or at another one, if it knows its field there.
+    `sigma` defaults to the model's own; another value must be supported by the model.
     """
     features = model.encode(pairs.images)
     condition = model.condition(features[pairs.reference], features[pairs.query])[:, None, None]
@@ -171,7 +171,7 @@ def model_field(
 def model_landscapes(
     model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, grid: Grid, sigma: float | None = None
 ) -> list[Landscape]:
-    """A model's energy over a grid for B pairs, at relative radii `[B]`; of a score model the length of the score."""
+    """A model's energy (for a score model, the score's length) over a grid for B pairs, at relative radii `[B]`."""
     score, energy = model_field(model, pairs, radius, grid, sigma)
     values = (score.norm(dim=-1) if energy is None else energy).cpu()
     return [Landscape(*grid, *each) for each in zip(radius.tolist(), values, strict=True)]
@@ -184,15 +184,15 @@ def model_arrows(model: PoseModel | ExactModel, pairs: Pairs, radius: Tensor, sp
 
 
 def arrows(grid: Grid, scores: Tensor) -> list[Arrows]:
-    """Scores `[B, A, O, 3]` on a grid of latitudes and longitudes, as arrays."""
+    """Convert scores `[B, A, O, 3]` on a grid of latitudes and longitudes to arrays."""
     latitude, longitude = (each.rad2deg().numpy() for each in grid)
     return [Arrows(latitude, longitude, score) for score in scores.detach().cpu().numpy()]
 
 
 def field_error(model: PoseModel, pairs: Pairs, truth: Tensor, spacing: float) -> float:
-    """How far a model's scores are from the exact ones, at the arrows of B pairs with true relative poses `[B, 3]`.
+    """Relative error of a model's scores at the arrows of B pairs with true relative poses `[B, 3]`.
 
-    The root of the mean squared distance over that of the mean squared exact score; radii are the true ones.
+    The RMS distance to the exact scores divided by the RMS exact score, at the true radii.
     """
     exact, learned = (
         model_field(each, pairs, truth[:, 2], cell_grid(spacing)).score

@@ -1,4 +1,4 @@
-"""Landscapes over relative latitude and longitude as plain arrays, their valleys, and what is mapped beside them.
+"""Energy landscapes over relative latitude and longitude as plain arrays, their valleys, and score fields.
 
 See the paper's Figures 1 and 2 (appendix, Additional Zero123 MSE Landscape Visualization); `fields` fills the arrays.
 """
@@ -15,17 +15,17 @@ from torch import Tensor
 
 from lp_framework.errors import UserError
 
-FLAT = 0.9  # a valley floor of which no more than a tenth of the range is relief tells nothing of the longitude
-PROMINENCE = 0.05  # of the landscape's range; a shallower dent is no minimum
+FLAT = 0.9  # if the floor spans at most a tenth of the range, the longitude is undetermined
+PROMINENCE = 0.05  # of the landscape's range; shallower dips do not count as minima
 
 Grid = tuple[Tensor, Tensor]  # relative latitudes `[A]` and longitudes `[O]`, radians
 
 
 class LandscapeMinimum(NamedTuple):
-    """A valley's bottom: its place (radians, between the grid's points), and the energy at the nearest of those.
+    """A local minimum: its position (radians, between grid points), and the energy at the nearest grid point.
 
-    In the landscape's range from 0 to 1, `height` is where that lies, and `prominence` the climb from there to the
-    lowest pass into deeper ground; of the deepest minimum it is 1.
+    `height` is that energy scaled to the landscape's range, 0 to 1. `prominence`, on the same scale, is the climb
+    to the lowest pass into a deeper valley; it is 1 for the deepest minimum.
     """
 
     latitude: float
@@ -38,7 +38,7 @@ class LandscapeMinimum(NamedTuple):
 class Landscape(NamedTuple):
     """Energies `[A, O]` of a pair at relative latitudes `[A]`, longitudes `[O]` (radians) and `radius` (scene units).
 
-    Latitudes ascend; longitudes are evenly spaced over the whole turn, from 0 up.
+    Latitudes ascend; longitudes are evenly spaced over the full turn, starting at 0.
     """
 
     latitude: Tensor
@@ -47,27 +47,27 @@ class Landscape(NamedTuple):
     energy: Tensor
 
     def minima(self) -> list[LandscapeMinimum]:
-        """Its local minima, the deepest first; see `valleys`. Places are refined by a parabola along either angle."""
+        """Local minima, deepest first; see `valleys`. Positions are refined by a parabola along each angle."""
         return [
             LandscapeMinimum(*self._place(cell), self.energy.flatten()[cell].item(), height, prominence)
             for cell, height, prominence in valleys(self.energy, PROMINENCE)
         ]
 
     def floor(self) -> Tensor:
-        """The lowest ground at each longitude `[O]`, in the landscape's range from 0 to 1; all 0 without relief."""
+        """Lowest energy at each longitude `[O]`, scaled to the landscape's range, 0 to 1; all 0 without relief."""
         low, high = self.energy.min(), self.energy.max()
         return (self.energy.min(dim=0).values - low) / torch.where(high > low, high - low, 1.0)
 
     def flatness(self) -> float:
-        """How little the longitude tells: 1 where a valley of one depth runs all around, 0 where a wall blocks it."""
+        """How little the longitude matters: 1 if a valley of constant depth runs all around, 0 if a wall blocks it."""
         return 1 - self.floor().max().item()
 
     def density(self) -> Landscape:
-        """exp(-E) over its greatest, in the place of the energy."""
+        """The landscape of exp(-E), divided by its maximum."""
         return self._replace(energy=(self.energy.min() - self.energy).exp())
 
     def _place(self, cell: int) -> tuple[float, float]:
-        """Latitude and longitude (radians) of the bottom of the parabolas through a minimum and its neighbours."""
+        """Latitude and longitude (radians) of the vertices of the parabolas through a minimum and its neighbours."""
         rows, columns = self.energy.shape
         row, column = divmod(cell, columns)
         latitude, longitude = self.latitude[row].item(), self.longitude[column].item()
@@ -80,18 +80,18 @@ class Landscape(NamedTuple):
 
 
 def _vertex(left: float, middle: float, right: float) -> float:
-    """Where the parabola through three values at -1, 0, 1 is least, at most half a step away; 0 where it is flat."""
+    """Minimum of the parabola through three values at -1, 0, 1, at most half a step from 0; 0 if it is flat."""
     curvature = left - 2 * middle + right
     return min(max((left - right) / (2 * curvature), -0.5), 0.5) if curvature > 0 else 0.0
 
 
 def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
-    """The valleys of energies `[A, O]` whose prominence is `least` or more, the deepest first.
+    """Find the valleys of energies `[A, O]` with a prominence of at least `least`, deepest first.
 
-    Of each the number of its lowest point in the flattened grid, and `height` and `prominence` as of the minimum.
-    The grid is periodic in longitude and open in latitude: the lowest ground on a border is a valley as well. A point
-    has eight neighbours. Equal energies side by side are one minimum, saddles are none, energies that are not finite
-    are passed over, and without relief there is no valley.
+    Returns the index of each valley's lowest point in the flattened grid, and its `height` and `prominence` as in
+    `LandscapeMinimum`. Points have eight neighbours; the grid is periodic in longitude and open in latitude, so a
+    minimum on the border counts. A plateau of equal energies is one minimum, a saddle is none. Energies that are not
+    finite are ignored, and a flat landscape has no valley.
     """
     rows, columns = energy.shape
     heights = energy.double().flatten().tolist()
@@ -99,8 +99,8 @@ def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
     if not ascending or heights[ascending[0]] == heights[ascending[-1]]:
         return []
     low, relief = heights[ascending[0]], heights[ascending[-1]] - heights[ascending[0]]
-    basin: dict[int, int] = {}  # of a flooded point a point of the same basin, and at last the basin's bottom
-    climbs: dict[int, float] = {}  # from a basin's bottom to the pass where it meets a deeper one
+    basin: dict[int, int] = {}  # union-find: maps a flooded point towards the bottom of its basin
+    climbs: dict[int, float] = {}  # from the bottom of a basin to its pass into a deeper one
 
     def bottom(cell: int) -> int:
         while basin[cell] != cell:
@@ -108,7 +108,7 @@ def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
             cell = basin[cell]
         return cell
 
-    # The points are flooded from below: one without flooded neighbours begins a basin, one between basins is a pass.
+    # Flood the points from below: one without flooded neighbours starts a basin, one between basins is a pass.
     for cell in ascending:
         row, column = divmod(cell, columns)
         around = [
@@ -130,9 +130,9 @@ def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
 def landscape_grid(
     latitude_limit_degrees: float = 60.0, latitude_step_degrees: float = 8.0, longitude_step_degrees: float = 12.0
 ) -> Grid:
-    """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) of a landscape; the defaults are the paper's.
+    """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) of a landscape; defaults follow the paper.
 
-    Latitudes go from minus the limit up. `UserError` where the longitudes would not be even over the turn.
+    Latitudes start at minus the limit. `UserError` if the longitude step does not divide the full turn.
 
     >>> [len(each) for each in landscape_grid()]
     [16, 30]
@@ -153,7 +153,7 @@ def landscape_grid(
 def cell_grid(spacing: float) -> Grid:
     """Relative latitudes `[A]` and longitudes `[O]` (radians, float32) at the centres of cells, for arrows.
 
-    The cells, of about `spacing` degrees, fill longitudes 0..360 and latitudes -60..60 (degrees).
+    The cells are about `spacing` degrees wide and cover longitudes 0..360 and latitudes -60..60 (degrees).
 
     >>> torch.rad2deg(cell_grid(60.0)[0])
     tensor([-30.0000,  30.0000])
@@ -166,7 +166,7 @@ def cell_grid(spacing: float) -> Grid:
 
 class Arrows(NamedTuple):
     """A score field on `cell_grid`: `latitude` `[A]` and `longitude` `[O]` in degrees, `score` `[A, O, 3]` (latitude,
-    longitude, radius; radians, scene units). The longest arrow stands for a score of length `scale`, None: of its own.
+    longitude, radius; radians, scene units). The longest arrow shows a score of length `scale` (None: the longest).
     """
 
     latitude: NDArray
@@ -179,5 +179,5 @@ class Arrows(NamedTuple):
         return np.hypot(self.score[..., 0], self.score[..., 1])
 
     def longest(self) -> float:
-        """The greatest length in the plane of the map, 0 for a field of nothing."""
+        """The greatest length in the plane of the map; 0 for an empty field."""
         return float(np.nan_to_num(self.lengths(), posinf=0.0).max())

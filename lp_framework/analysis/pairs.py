@@ -1,7 +1,7 @@
-"""Pairs that are shown, as plain arrays: which views they are, and all that explains what a solver does with them.
+"""Pairs for display, as plain arrays: their views, and everything that explains what a solver does with them.
 
-The functions take pairs in two forms, on a device for networks (`Pairs`) and as arrays (`ShownPair`, one a pair), and
-return the arrays with more in them.
+The functions take pairs both as tensors on a device (`Pairs`) and as arrays (one `ShownPair` per pair), and return
+the arrays with more fields filled in.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PRIOR_ENERGY = "energy of the prior"
 @dataclass(frozen=True)
 class View:
     """One image of a pair: its file, its pixels `[H, W, 3]` (uint8), its true view pose `[3]` and its field of view
-    (radians), by default that of the priors, as for crops to the object."""
+    (radians; defaults to that of the priors, as for crops to the object)."""
 
     file: Path
     image: NDArray
@@ -47,11 +47,11 @@ class View:
 
 @dataclass(frozen=True)
 class ShownPair:
-    """A pair and what a solver did with it, for N starts; radians and object sizes, NaN where there is no number.
+    """A pair and what a solver did with it, for N starts, in radians and object sizes; NaN if unknown.
 
-    `truth` `[3]`, `ends` `[N, 3]` and `starts` `[N, 3]` are relative poses, `trajectories` `[N, S + 1, 3]` have
-    longitudes unreduced; None where the solver keeps no trajectory or makes its own candidates, and for the truth of
-    photographs. `energies` `[N]` are the solver's, `chosen` is its answer, None where that is no pose;
+    `truth` `[3]`, `starts` and `ends` `[N, 3]` are relative poses; `trajectories` `[N, S + 1, 3]` have unwrapped
+    longitudes. `trajectories` is None if the solver keeps none, `starts` if it makes its own candidates, and `truth`
+    for photographs. `energies` `[N]` are the solver's; `chosen` indexes its answer, None if that is not a pose.
     `rotation_errors` (degrees) and `translation_errors` are `[N]`. A pair that was not solved has no ends.
     `landscapes` are by name, at the true relative radius; `maps` are drawn beside the images.
     """
@@ -74,12 +74,12 @@ class ShownPair:
 
     @property
     def title(self) -> str:
-        """The object's name as it is read."""
+        """The object's name for display."""
         return words(self.object)
 
     @property
     def failed(self) -> bool:
-        """Whether the answer is known to be further off than the widest threshold; without an answer it is."""
+        """Whether the answer's error exceeds the widest threshold; False without a truth, True without an answer."""
         if self.truth is None:
             return False
         return self.chosen is None or not self.rotation_errors[self.chosen] <= ROTATION_THRESHOLDS[-1]
@@ -90,13 +90,13 @@ class ShownPair:
         return self.landscapes[PRIOR_ENERGY]
 
     def start_longitudes(self) -> list[float] | list[None]:
-        """Of each end the longitude of its start, degrees in [0, 360); None where the solver made its own."""
+        """Longitude of each end's start, degrees in [0, 360); None if the solver made its own starts."""
         if self.starts is None:
             return [None] * len(self.ends)
         return (np.rad2deg(self.starts[:, 1]) % 360).tolist()
 
     def arrived(self) -> ShownPair:
-        """The pair with those starts alone that came to a pose."""
+        """The pair with only the starts that reached a finite pose."""
         sound = np.isfinite(self.ends).all(axis=-1)
         lost = self.chosen is None or not sound[self.chosen]
         names = ("starts", "trajectories", "ends", "energies", "rotation_errors", "translation_errors")
@@ -105,9 +105,9 @@ class ShownPair:
 
 
 class PoseMap(NamedTuple):
-    """A map of relative latitude and longitude: its title and what is on it, from the ground up.
+    """A map of relative latitude and longitude: its title and its layers, from bottom to top.
 
-    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; the `ways` that a solver took in a pair.
+    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; a solver's trajectories as `ways`.
     """
 
     title: str = ""
@@ -118,7 +118,7 @@ class PoseMap(NamedTuple):
 
 
 def words(name: str) -> str:
-    """An object's or a solver's name as it is read.
+    """Format the name of an object or solver for display.
 
     >>> words("two_stage")
     'two stage'
@@ -127,14 +127,14 @@ def words(name: str) -> str:
 
 
 ARROW_SPACING = 12.0  # degrees
-SAMPLING = (50, 3.0)  # steps and guidance of DDIM, for what the prior generates at the ends
+SAMPLING = (50, 3.0)  # DDIM steps and guidance for the views generated at the ends
 DENSITY_GRID = landscape_grid(60.0, 4.0, 6.0)
 
 
 def shown_pairs(data: PairData, views: NDArray[np.int64], device: torch.device) -> tuple[Pairs, list[ShownPair]]:
-    """P pairs of views (reference, query) by their numbers `[P, 2]` in the data's table; on a device, and as arrays."""
+    """P pairs of views (reference, query) by their indices `[P, 2]` in the data's table, on a device and as arrays."""
     table, batch, images = data.table, data[views], data.images
-    assert images is not None  # nothing that is shown caches features
+    assert images is not None  # displayed data never cache features
     shown = []
     for pair, truth in zip(views, batch.relative_poses().numpy(), strict=True):
         index = int(table.object_of_view[pair[0]])
@@ -150,7 +150,7 @@ def shown_pairs(data: PairData, views: NDArray[np.int64], device: torch.device) 
 def named_pairs(
     data: PairDataModule, objects: Sequence[str], places: Sequence[tuple[int, int]], device: torch.device
 ) -> tuple[Pairs, list[ShownPair]]:
-    """Pairs of test views (reference, query), numbered from 0 within their object; `UserError` for unknown ones."""
+    """Pairs of test views (reference, query), numbered from 0 within their object; `UserError` if unknown."""
     table = data.table("test")
     chosen = []
     for name, pair in zip(objects, places, strict=True):
@@ -165,7 +165,7 @@ def named_pairs(
 
 
 def object_index(data: PairDataModule, name: str) -> int:
-    """The place of an object in the table of test views; `UserError` where there is none of that name."""
+    """The index of an object in the table of test views; `UserError` if the name is unknown."""
     names = data.table("test").names
     if name not in names:
         raise UserError(f"the data set has no object '{name}'{nearest(name, names)} (known: {', '.join(names)})")
@@ -180,13 +180,13 @@ def truths(shown: Sequence[ShownPair]) -> Tensor:
 def solved_pairs(
     pairs: Pairs, shown: Sequence[ShownPair], solver: Solver, starts: Tensor, seed: int
 ) -> list[ShownPair]:
-    """The pairs with what a solver did from starts `[P, N, 3]`, its trajectories too; all are solved at once."""
+    """Solve all pairs at once from starts `[P, N, 3]`, and return them with the solutions and trajectories."""
     solution = recording(solver).solve(pairs, starts, seed)
     return [with_solution(pair, solution, starts, place) for place, pair in enumerate(shown)]
 
 
 def with_solution(pair: ShownPair, solution: Solution, starts: Tensor, place: int) -> ShownPair:
-    """The pair with the solution's problem number `place`, without starts where the solver made its own candidates."""
+    """The pair with the solution at index `place`; it gets no starts if the solver made its own candidates."""
     ends = _array(solution.poses[place])
     errors = np.full(len(ends), np.nan)
     if pair.truth is not None:
@@ -209,7 +209,7 @@ def with_solution(pair: ShownPair, solution: Solution, starts: Tensor, place: in
 
 
 def recording(solver: Solver) -> Solver:
-    """A copy of the solver and of those it is made of, told to keep trajectories where they have a setting for it."""
+    """A copy of the solver and its nested solvers that keeps trajectories if there is a setting for it."""
     solver = copy.copy(solver)
     for name, part in vars(solver).items():
         if isinstance(part, Solver):
@@ -222,7 +222,7 @@ def recording(solver: Solver) -> Solver:
 def with_prior_energy(
     pairs: Pairs, shown: Sequence[ShownPair], prior: Prior, draws: fields.Draws, grid: Grid | None = None
 ) -> list[ShownPair]:
-    """The pairs with the prior's landscape, on the paper's grid unless given, at the true relative radii or at 0."""
+    """Add the prior's landscape, on the paper's grid by default, at the true relative radii (0 if unknown)."""
     found = fields.prior_landscapes(prior, pairs, _radii(shown), grid or landscape_grid(), draws)
     return _with_landscapes(shown, PRIOR_ENERGY, found)
 
@@ -230,7 +230,7 @@ def with_prior_energy(
 def with_model_landscape(
     pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel, sigma: float | None = None
 ) -> list[ShownPair]:
-    """The pairs with `model_landscapes` at their true relative radii or at 0."""
+    """Add `model_landscapes` at the true relative radii (0 if unknown)."""
     name = "energy of the model" if model.has_energy else "length of the model's score"
     found = fields.model_landscapes(model, pairs, _radii(shown), landscape_grid(), sigma)
     return _with_landscapes(shown, name, found)
@@ -248,17 +248,17 @@ def with_fields(
     pairs: Pairs, shown: Sequence[ShownPair], model: PoseModel, solved: Sequence[ShownPair],
     first_stage: Langevin | None, starts: Tensor, seed: int,
 ) -> list[ShownPair]:  # fmt: skip
-    """The pairs with two maps each, in one scale: the model's field, and the exact one, the best there is to learn.
+    """Add two maps to each pair, in one scale: the model's field, and the exact field, the target of training.
 
-    Over the first are the ways of the pairs as they were `solved`, over the second those of `first_stage`, where there
-    is one, with the exact field in the model's place.
+    The first shows the trajectories of the `solved` pairs. The second shows those of `first_stage`, if given, with the
+    exact field in place of the model's.
     """
     exact = fields.ExactModel(model.kernel, truths(shown), model.has_energy)
     ideal: Sequence[ShownPair | None] = [None] * len(shown)
     if first_stage is not None:
         guided = copy.copy(first_stage)
-        guided.model = exact  # type: ignore[assignment]  # has all of a PoseModel that this solver asks for
-        guided.sigmas = None  # the exact field is that at the model's sigma
+        guided.model = exact  # type: ignore[assignment]  # has every part of a PoseModel that this solver uses
+        guided.sigmas = None  # the exact field is defined at the model's sigma
         ideal = solved_pairs(pairs, shown, guided, starts, seed)
     name, radius = "exp(-E) and score" if model.has_energy else "score", truths(shown)[:, 2]
     maps = []
@@ -275,7 +275,7 @@ def with_fields(
 
 
 def in_one_scale(maps: Sequence[PoseMap]) -> list[PoseMap]:
-    """Maps whose arrows are all in the scale of the longest."""
+    """The maps, with all arrows scaled to the longest one."""
     scale = max(each.arrows.longest() for each in maps if each.arrows is not None)
     return [each._replace(arrows=each.arrows and each.arrows._replace(scale=scale)) for each in maps]
 
@@ -284,15 +284,15 @@ def explained_pair(
     pairs: Pairs, pair: ShownPair, solver: Solver, prior: Prior, model: PoseModel | None,
     starts: Tensor, draws: fields.Draws, grid: Grid,
 ) -> tuple[ShownPair, list[NDArray], FieldValue | None]:  # fmt: skip
-    """One pair, solved once, with those starts alone that came to a pose; what the prior generates at the ends,
-    `[N, H, W, 3]`; and the model's field on the landscape's grid, where there is a model.
+    """Solve one pair. Returns it with only the starts that reached a finite pose; the prior's views at the ends,
+    `[N, H, W, 3]`; and the model's field on the landscape's grid, if there is a model.
 
-    The maps are of the first stage without noise; photographs, whose truth is not known, have none.
+    The maps show the first stage without noise. Photographs have none, since their truth is unknown.
     """
     seed, field, views = draws.seed, None, []
     (pair,) = solved_pairs(pairs, with_prior_energy(pairs, [pair], prior, draws, grid), solver, starts, seed)
     pair = pair.arrived()
-    if pair.trajectories is not None:  # the same poses, with longitudes unreduced
+    if pair.trajectories is not None:  # the same poses, with unwrapped longitudes
         pair = replace(pair, ends=pair.trajectories[:, -1])
     if len(pair.ends):
         source = prior.encode(pairs.images[pairs.reference])
