@@ -1,1 +1,1 @@
-"""The commands, a module each: `run(config)` gets the composed configuration."""
+"""The commands, one module each; `run(config)` takes the composed configuration."""

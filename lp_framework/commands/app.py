@@ -13,12 +13,12 @@ from lp_framework.analysis.fields import Draws
 from lp_framework.commands.building import begin
 from lp_framework.errors import UserError, optional_import
 
-TIMESTEPS = (100, 300, 500, 700, 900)  # over which a prior's energy is averaged, one noise at each, as by `landscape`
-RADIUS = 1.4  # of the first camera, as by `estimate`
+TIMESTEPS = (100, 300, 500, 700, 900)  # a prior's energy averages over these, with one noise each, as in `landscape`
+RADIUS = 1.4  # of the first camera, as in `estimate`
 
 
 def run(config: DictConfig) -> None:
-    """Serve the app at an address that is printed first."""
+    """Print the address and serve the app."""
     optional_import("dash", "app", "pip install 'lp_framework[app]'")
     from werkzeug.serving import make_server
 
@@ -41,7 +41,7 @@ def run(config: DictConfig) -> None:
     planned = config.data.get("test_views")  # None: the views are there already
     views = {name: planned or len(data.source.views(name, "test")) for name in data.source.names()}
     app = make_app(bench, jobs, visitors, config.object, views, Path(config.folder), most)
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # a line for each request
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # else it prints a line per request
     try:
         listening = socket.create_server((config.host, config.port))
     except (OSError, OverflowError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""`bench`: speed and memory claims, contenders side by side in one run."""
+"""`bench`: measure speed and memory, with both contenders in one run."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MEASUREMENTS: dict[str, Callable[..., None]] = {
 
 
 def run(config: DictConfig) -> None:
-    """Run the measurements named in `measure`; one that is stopped keeps what it has measured in `bench.json`."""
+    """Run the measurements named in `measure`. An interrupted run saves its results so far in `bench.json`."""
     folder, device, _ = begin(config)
     settings = plain(config)
     names = [settings["measure"]] if isinstance(settings["measure"], str) else settings["measure"]
@@ -68,11 +68,11 @@ def run(config: DictConfig) -> None:
 
 
 def arguments(name: str, settings: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
-    """What a measurement takes besides its section: the settings of its name, and objects by theirs."""
-    components = Components(settings)  # anew, so that no measurement finds the GPU full of another's networks
+    """The arguments of a measurement besides its section: its settings, and the objects it needs by name."""
+    components = Components(settings)  # rebuilt, so that no networks of another measurement fill the GPU
     makers: dict[str, Callable[[], object]] = {
         "computing": lambda: zero123.Computing(**_settings(settings, "second_stage", zero123.Computing)),
-        # The one that ships: figures are to be compared, whatever has been trained here.
+        # Always the bundled model, so that results are comparable across machines.
         "model": lambda: load_model(SHIPPED / "score").to(device),
         "new_model": lambda: components["model"].to(device),
         "prior": lambda: components["prior"].to(device),
@@ -86,7 +86,7 @@ def arguments(name: str, settings: Mapping[str, Any], device: torch.device) -> d
 
 
 def _settings(settings: Mapping[str, Any], section: str, taker: Callable[..., Any]) -> dict[str, Any]:
-    """Of a section of the config what the taker has arguments for; whole numbers are counts."""
+    """The settings in a config section that `taker` has arguments for; integers must be at least 1."""
     wanted = inspect.signature(taker).parameters
     values = {key: value for key, value in settings[section].items() if key in wanted}
     values = registry.checked(taker, values, f"{section}.")
@@ -100,15 +100,15 @@ def _settings(settings: Mapping[str, Any], section: str, taker: Callable[..., An
 
 
 def paper_seconds() -> dict[int, float]:
-    """The paper's seconds per pair by the number of starts (appendix, Analysis of Inference Time)."""
+    """The paper's seconds per pair, by number of starts (appendix, Analysis of Inference Time)."""
     table = paper_table("starts")
-    assert table is not None  # it is in this package
+    assert table is not None  # it ships with the package
     rows = [row for row in table.rows if row.settings["solver.name"] == "two_stage"]
     return {int(str(row.settings["start.count"])): row.metrics["seconds_per_pair"] for row in rows}
 
 
 def show(sections: Mapping[str, Section], results: Path) -> None:
-    """What has been measured, on the terminal."""
+    """Print the measurements."""
     console = Console(highlight=False, width=None if Console().is_terminal else 110)
     console.print(table(list(sections.values())))
     for name, section in sections.items():
@@ -118,7 +118,7 @@ def show(sections: Mapping[str, Section], results: Path) -> None:
 
 
 def table(sections: list[Section]) -> Table:
-    """Medians, a section a measurement; ratios are those of the first contender to the second."""
+    """Table of medians, one section per measurement; ratios are first contender to second."""
     result = Table(box=box.SIMPLE, show_header=False, show_edge=False, pad_edge=False)
     result.add_column()
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""From a composed config to objects, and what every run records of itself."""
+"""Build objects from a composed config, and record facts about each run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lp_framework.run_folders import relative
 
 log = logging.getLogger(__name__)
 
-TRAINING = "training.json"  # what a training run says of itself
+TRAINING = "training.json"  # the record of a training run
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
@@ -44,10 +44,10 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 class Components:
-    """The objects that a config chooses, each built once when it is first asked for: `components["solver"]`.
+    """The objects chosen by a config, each built once on first access: `components["solver"]`.
 
-    An object gets the components that its constructor declares. Where the config has no group `model`, the model is
-    that of a checkpoint: of the setting `checkpoint`, or of the one given here.
+    An object receives the components that its constructor declares. If the config has no group `model`, the model is
+    loaded from the given checkpoint or, by default, from the setting `checkpoint`.
     """
 
     def __init__(self, settings: Mapping[str, Any], checkpoint: Path | None = None) -> None:
@@ -60,18 +60,18 @@ class Components:
         return self._built[group]
 
     def needs(self, group: str) -> list[str]:
-        """The components that the chosen member of a group asks for."""
+        """The components required by the chosen member of a group."""
         return registry.component_names(registry.get(group, self.settings[group]["name"]))
 
     def test_views(self, protocol: str = "ordered") -> PairDataModule:
-        """The data, prepared for the pairs of a protocol among their test views."""
+        """The data, prepared for a protocol's pairs of test views."""
         data: PairDataModule = self["data"]
         data.evaluate_on(protocol, self.settings.get("seed", 0))
         data.prepare_data()
         return data
 
     def record(self) -> dict[str, Any]:
-        """What results say of the run that made them."""
+        """What results record about their run."""
         return {"seed": self.settings["seed"], "config": self.settings, "versions": versions()}
 
     def _build(self, group: str) -> Any:
@@ -83,7 +83,7 @@ class Components:
         settings, components = self.settings[group], {each: self[each] for each in self.needs(group)}
         if group != "data":
             return registry.build(group, settings, **components)
-        loader, _ = registry.parameters(PairDataModule)  # the settings are its own and those of the source of views
+        loader, _ = registry.parameters(PairDataModule)  # the rest of the settings belong to the source of views
         own = {key: value for key, value in settings.items() if key not in loader}
         shared = {key: value for key, value in settings.items() if key in loader}
         source: ViewSource = registry.build("data", own, **components)
@@ -91,7 +91,7 @@ class Components:
 
 
 def warn_of_unused(components: Components) -> None:
-    """Say that a prior or a checkpoint named on the command line has no effect on this solver; not in a sweep."""
+    """Warn if a prior or checkpoint named on the command line has no effect on this solver; silent in sweeps."""
     job, name = HydraConfig.get(), components.settings["solver"]["name"]
     named = {override.partition("=")[0].strip("+~").partition(".")[0] for override in job.overrides.task}
     needed = {*components.needs("solver"), *(components.needs("start") if "start" in components.settings else ())}
@@ -101,15 +101,15 @@ def warn_of_unused(components: Components) -> None:
 
 
 def warn_of_photographs(prior: Mapping[str, Any]) -> None:
-    """Say that the bundled prior knows no photographs where `prior`, its settings, choose it."""
+    """Warn if the settings `prior` choose the bundled prior, which does not support photographs."""
     if prior["name"] == "tiny" and prior["path"] is None:
         log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_KNOWS)
 
 
 def begin(config: DictConfig) -> tuple[Path, torch.device, Components]:
-    """What a run without a trainer begins with: its folder, the device of `accelerator`, and what the config chooses.
+    """Set up a run without a trainer: return its folder, the device of `accelerator`, and the components.
 
-    The device is a GPU where there is one for `auto`, `cpu`, or a GPU by its type, `cuda` or `mps`.
+    `accelerator` is `auto` (a GPU if there is one), `cpu`, or the type of a GPU, `cuda` or `mps`.
     """
     folder = run_folder()
     seed_run(config.get("seed", 0))
@@ -122,7 +122,7 @@ def begin(config: DictConfig) -> tuple[Path, torch.device, Components]:
 
 
 def seed_run(seed: object) -> None:
-    """Seed the global random state, from which weights are initialised."""
+    """Seed the global random state, which initializes weights."""
     if not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise UserError(f"seed must be a whole number between 0 and 2^32 - 1, got {seed}")
     seed_everything(seed, verbose=False)
@@ -131,7 +131,7 @@ def seed_run(seed: object) -> None:
 def build_trainer(
     settings: Mapping[str, Any], folder: Path, callbacks: list[Callback], logger: list[Logger]
 ) -> Trainer:
-    """Lightning's trainer with `settings` as its arguments."""
+    """Build Lightning's trainer with `settings` as its arguments."""
     arguments = registry.checked(Trainer.__init__, settings, "trainer.")
     try:
         return Trainer(
@@ -140,14 +140,14 @@ def build_trainer(
             callbacks=callbacks,
             logger=logger,
             plugins=[WholeCheckpointIO()],
-            use_distributed_sampler=False,  # the data module's samplers know the processes
+            use_distributed_sampler=False,  # the data module's samplers handle the processes
         )
     except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
         raise UserError(f"trainer: {one_line(error)}") from error
 
 
 def run_folder() -> Path:
-    """The folder of this run, made if need be; relative to the working directory where it lies below it."""
+    """Create and return the folder of this run, relative to the working directory if it is inside it."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     folder.mkdir(parents=True, exist_ok=True)
     return relative(folder)
@@ -155,8 +155,7 @@ def run_folder() -> Path:
 
 @contextmanager
 def resumable(folder: Path, kept: str) -> Iterator[None]:
-    """Say of a run that is interrupted, or finds the disk full, how it goes on, where `kept` in its `folder` holds any
-    of it."""
+    """Explain how to resume a run that is interrupted or fills the disk, if its `folder` has files in `kept`."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit, DiskFull) as error:  # Lightning exits after an interruption
@@ -169,9 +168,9 @@ def resumable(folder: Path, kept: str) -> Iterator[None]:
 
 
 def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[str, ...], saved: Path) -> DictConfig:
-    """The config of a resumed run: `previous`, of the file or folder `saved`, with what the command line changes.
+    """The config of a resumed run: `previous`, loaded from `saved`, with the changes of the command line.
 
-    Raises `UserError` for a key on it that does not begin as one of `changeable`.
+    Raises `UserError` if a changed key does not start with one of `changeable`.
     """
     overrides = HydraConfig.get().overrides.task
     keys = {override.partition("=")[0].strip("+~") for override in overrides} - {"resume", "plugins"}
@@ -183,7 +182,7 @@ def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[s
 
 
 def weights_fingerprint(networks: Sequence[nn.Module], sample: int = 1024) -> str:
-    """A text that changes when networks do: of every parameter and buffer its name, shape and `sample` first values."""
+    """Hash networks by the name, shape, dtype and first `sample` values of every parameter and buffer."""
     digest = hashlib.blake2b(digest_size=16)
     for network in networks:
         for name, value in network.state_dict().items():
@@ -194,7 +193,7 @@ def weights_fingerprint(networks: Sequence[nn.Module], sample: int = 1024) -> st
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes, and the commit of the source tree where there is one, `-dirty` if it was changed."""
+    """Package versions and the commit of the source tree, if there is one, with `-dirty` if it was modified."""
     packages = ("lp_framework", "torch", "torchvision", "lightning", "numpy", "trimesh", "pyrender")
     found = {name: importlib.metadata.version(name) for name in packages}
     return {"python": platform.python_version(), **found, "git": _git_state()}

@@ -1,4 +1,4 @@
-"""`convert`: an original Zero123 checkpoint, or a training run of this framework, to a folder of safetensors."""
+"""`convert`: turn an original Zero123 checkpoint, or a training run of this framework, into a safetensors folder."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lp_framework.report.model_card import CARD, model_card
 
 
 def run(config: DictConfig) -> None:
-    """Read `path` (with `weights` and `dtype`) and write the folder `output`, which `prior.path` then takes.
+    """Read `path` (with `weights` and `dtype`) and write the folder `output`, for use as `prior.path`.
 
-    Of a training run that holds a pose model, `checkpoint` takes it.
+    If `path` is the training run of a pose model, use it as `checkpoint` instead.
     """
     registry.checked(load_networks, {"weights": config.weights, "dtype": config.dtype}, "")
     output = Path(config.output)
@@ -41,12 +41,12 @@ def run(config: DictConfig) -> None:
 
 
 def upload(folder: Path, hub_id: str) -> str:
-    """Upload a folder to the Hugging Face hub, into a repository that is made if need be; returns its address."""
+    """Upload a folder to the Hugging Face hub, creating the repository if needed; returns its address."""
     hub = optional_import("huggingface_hub", f"hub={hub_id}", "pip install 'lp_framework[zero123]'")
     try:
         address = hub.create_repo(hub_id, exist_ok=True)
         hub.upload_folder(repo_id=hub_id, folder_path=folder)
-    except (OSError, ValueError) as error:  # the hub's errors are of these
+    except (OSError, ValueError) as error:  # base classes of the hub's errors
         again = f"{folder} is written; `hf upload {hub_id} {folder}` tries again"
         raise UserError(f"hub={hub_id}: the upload failed ({one_line(error)}); {again}") from error
     return str(address)

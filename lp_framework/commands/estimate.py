@@ -1,4 +1,4 @@
-"""`estimate`: camera poses of photographs of one object, for people, NeRF programs and COLMAP."""
+"""`estimate`: camera poses of photographs of one object, for people, NeRF tools and COLMAP."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run(config: DictConfig) -> None:
 
 
 def warn_of_prior(components: Components) -> None:
-    """Warn of a prior that knows no photographs where the solver's answer rests on it."""
+    """Warn if the solver uses a prior that does not support photographs."""
     if "prior" in components.needs("solver"):
         warn_of_photographs(components.settings["prior"])
 
@@ -63,7 +63,7 @@ def _reference_pose(latitude_degrees: object, radius: object) -> Tensor:
 
 
 def _print(folder: Path, found: Estimate, written: Written) -> None:
-    """The rows of `poses.csv` for people, and where everything is."""
+    """Print the rows of `poses.csv`, and where the output is."""
     rows = written.rows
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     table = Table(title="camera poses", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)

@@ -1,4 +1,4 @@
-"""`eval`: a solver on a data set's test views; one that was stopped goes on with `resume=RUN_FOLDER`."""
+"""`eval`: evaluate a solver on a data set's test views; `resume=RUN_FOLDER` resumes a stopped run."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from lp_framework.viz.maps import pair_figure
 from lp_framework.viz.sheets import ObjectCard, objects_figure
 from lp_framework.viz.style import save_figure
 
-LARGE = 100_000_000  # parameters; a few pairs of Zero123's size fill a GPU, and many would be long unsaved
-LARGE_SAMPLES = 72  # of networks that are large, in a pass: 4 pairs from 9 starts, 18 from 2
+LARGE = 100_000_000  # parameters; at Zero123's size, a few pairs fill a GPU, and more would delay saving
+LARGE_SAMPLES = 72  # per pass of a large network: 4 pairs from 9 starts, 18 from 2
 
 
 def run(config: DictConfig) -> None:
@@ -73,7 +73,7 @@ def run(config: DictConfig) -> None:
     data.evaluate_on(protocol, seed, batch_pairs, views)
     with building.resumable(folder, journal.FOLDER):
         trainer.test(evaluation, datamodule=data, verbose=False)
-    evaluation.to(trainer.strategy.root_device)  # Lightning has put it on the CPU, where GPUs' processes cannot gather
+    evaluation.to(trainer.strategy.root_device)  # Lightning moved it to the CPU, where processes of GPUs cannot gather
     result = {
         **evaluation.metrics.compute(),
         "protocol": protocol if views is None else "view_sets",
@@ -84,7 +84,7 @@ def run(config: DictConfig) -> None:
         "versions": subject["versions"],
     }
     if before is not None and before["versions"] != result["versions"]:
-        result["versions_before"] = before["versions"]  # of what was solved before it was stopped
+        result["versions_before"] = before["versions"]  # for the pairs solved before the run was stopped
     if trainer.is_global_zero:
         result["breakdown"] = breakdown(evaluation.metrics.rows(), evaluation.table)
         with building.resumable(folder, journal.FOLDER):
@@ -99,10 +99,10 @@ def run(config: DictConfig) -> None:
 
 
 def is_finished(folder: Path, subject: Mapping[str, Any]) -> bool:
-    """Whether `folder` has the results of this very job of a sweep, of the same views and not older than its
-    checkpoint; then says so.
+    """Whether `folder` already has the results of this job of a sweep, for the same views and not older than its
+    checkpoint; if so, prints it.
 
-    Raises `UserError` for other results, which are not overwritten; a job whose results cannot be read runs.
+    Raises `UserError` rather than overwrite other results. A job whose results are unreadable runs again.
     """
     file, checkpoint = folder / RESULT, subject["checkpoint"]
     result = read_record(file)
@@ -121,14 +121,14 @@ def is_finished(folder: Path, subject: Mapping[str, Any]) -> bool:
 
 @functools.cache
 def views_fingerprint(settings: str) -> str:
-    """That of the views which settings, as JSON, choose; looked at once for all jobs of a sweep."""
+    """Fingerprint of the views chosen by settings (as JSON); computed once for all jobs of a sweep."""
     chosen = json.loads(settings)
     data = building.Components(chosen).test_views(chosen["protocol"])
     return data.fingerprint(data.evaluation_split())
 
 
 def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig, Path | None]:
-    """The config and the checkpoint of the stopped `eval` in `folder`; `UserError` where there is none."""
+    """The config and checkpoint of the stopped `eval` in `folder`; `UserError` if there is none."""
     subject = journal.unfinished(folder)
     if subject is None and (folder / RESULT).is_file():
         raise UserError(f"resume={folder}: that run is finished; its results are in {folder / RESULT}")
@@ -140,7 +140,7 @@ def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig,
 
 
 def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
-    """Pairs in a batch: the setting `batch_pairs`, or by default what suits the size of the solver's networks."""
+    """Pairs per batch: the setting `batch_pairs`, or a default that fits the size of the solver's networks."""
     if batch_pairs is None:
         parameters = sum(each.numel() for network in solver.networks() for each in network.parameters())
         if parameters <= LARGE:
@@ -152,7 +152,7 @@ def pairs_at_once(batch_pairs: object, solver: Solver, starts: Starts) -> int:
 
 
 def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]) -> None:
-    """The table, the cost, and where the rest is."""
+    """Print the table, the cost, and where the output is."""
     config, views = result["config"], result["config"]["views"]
     console = Console(width=110 if not Console().is_terminal else None, highlight=False)
     choices = f"{config['data']['name']}, {config['solver']['name']}, start={config['start']['name']}"
@@ -162,7 +162,7 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
         console.print(table)
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
     told = result["breakdown"]
-    if told and told["calibration"]:  # of a model that tells how sure it is
+    if told and told["calibration"]:  # of a model with probabilities
         for line in lines(told):
             console.print(line, soft_wrap=True)
     if result["unanswered"]:
@@ -175,9 +175,9 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
 
 
 def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: Mapping[str, Any]) -> list[Path]:
-    """After `Trainer.test`: maps of some pairs (failures first), cumulative errors, and the objects, into `folder`.
+    """After `Trainer.test`, save maps of some pairs (failures first), cumulative errors, and the objects in `folder`.
 
-    Returns the PNG files. `EXAMPLES` below the folder gets the pairs, for the page of the run.
+    Returns the PNG files. The pairs themselves go to the subfolder `EXAMPLES`, for the page of the run.
     """
     examples = gather_examples(evaluation, data)
     save_examples(folder / EXAMPLES, examples)
@@ -195,7 +195,7 @@ def save_pictures(folder: Path, evaluation: Evaluation, data: PairData, result: 
     assert data.images is not None  # evaluation never caches features
     cards = []
     for index, name in enumerate(data.table.names):
-        if (metrics := result["per_object"][name]) is not None:  # without a success rate where a pair has one answer
+        if (metrics := result["per_object"][name]) is not None:  # no success rate if a pair has one answer
             view = np.asarray(data.images[data.table.views_of(index)[0]])
             rates = metrics["R(R)@15"], metrics.get("SR(R)@30")
             cards.append(ObjectCard(name, data.table.ambiguities[index], view, *rates))

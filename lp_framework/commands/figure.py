@@ -1,4 +1,4 @@
-"""`figure`: a figure of the paper, of any data, prior and models."""
+"""`figure`: a figure of the paper, for any data, prior and models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`landscape`: the prior's energy over relative poses, of a pair of views or around each object of a data set."""
+"""`landscape`: the prior's energy over relative poses, for a pair of views or around each object of a data set."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from lp_framework.viz.maps import minima_in_words, pair_figure, surface_figure
 from lp_framework.viz.style import save_figure
 
 GRID = ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degrees")
-OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview has no use for
+OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview does not use
 
 
 @torch.no_grad()
 def run(config: DictConfig) -> None:
-    """The landscape of a pair of views where one is named, else the overview of all objects."""
+    """Compute the landscape of a pair of views if one is named, else the overview of all objects."""
     check(config)
     folder, device, components = begin(config)
     grid = landscape_grid(**checked(landscape_grid, {key: config[key] for key in GRID}, ""))
@@ -82,7 +82,7 @@ def run(config: DictConfig) -> None:
 
 
 def check(config: DictConfig) -> None:
-    """`UserError` for settings that no landscape has."""
+    """Raise `UserError` for settings that no landscape has."""
     if not isinstance(config.azimuths, int) or config.azimuths < 2:
         raise UserError(f"azimuths must be a whole number, at least 2, got {config.azimuths}")
     if config.object is None and config.images is None:
@@ -95,7 +95,7 @@ def check(config: DictConfig) -> None:
 
 
 def pair_figures(pair: ShownPair, views: Sequence[NDArray], draws: Draws, heading: str) -> dict[str, Figure]:
-    """The pictures `landscape`, `surface` and `fields`; the last not of photographs, whose truth is not known."""
+    """The pictures `landscape`, `surface` and `fields`; the last needs the truth, which photographs lack."""
     energy = pair.prior_energy
     radius = f"{'' if pair.truth is None else 'true '}relative radius {energy.radius:+.2f}".replace("-", "\u2212")
     note = f"{minima_in_words(energy)} at the {radius}. {draws.in_words()}"
@@ -121,7 +121,7 @@ def data_pair(config: DictConfig, components: Components, device: torch.device) 
 
 
 def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownPair]:
-    """The two files of `images`, prepared as `estimate` prepares them, with its reference camera."""
+    """The two files of `images`, prepared as in `estimate`, with its reference camera."""
     files = photograph_files(config.images)
     if len(files) != 2:
         raise UserError(f"images: a landscape needs two files, got {len(files)}")
@@ -134,7 +134,7 @@ def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownP
 
 
 def landscape_arrays(pair: ShownPair, field: FieldValue | None) -> dict[str, Any]:
-    """What goes into `landscape.npz`: radians and scene units."""
+    """The arrays of `landscape.npz`, in radians and scene units."""
     landscape = pair.prior_energy
     arrays = {
         "latitude": landscape.latitude.numpy(), "longitude": landscape.longitude.numpy(),
@@ -178,7 +178,7 @@ def in_degrees(pose: NDArray) -> tuple[float, float, float]:
 
 
 def pair_table(title: str, method: str, record: dict[str, Any]) -> Table:
-    """The truth, the minima and the ends, as `summary` has them."""
+    """Table of the truth, the minima and the ends in `summary`."""
     columns = ("", "latitude", "longitude", "height", "prominence", "from the truth")
     table, truth = table_of(title, columns, numbers=columns[1:]), record["truth"]
     if truth is not None:
@@ -198,7 +198,7 @@ def pair_table(title: str, method: str, record: dict[str, Any]) -> Table:
 
 
 def overview_table(title: str, record: dict[str, Any]) -> Table:
-    """A row an object, then the shares over all of them; below it the objects without a unique answer."""
+    """One row per object and the shares over all, followed by the objects without a unique answer."""
     near = f"within {NEAR_DEGREES:g}°"
     columns = ("object", "class", near, "relief", "minima (degrees from truth: height)", "flatness", "verdict")
     table = table_of(title, columns, numbers=(near, "relief", "flatness"))
@@ -220,7 +220,7 @@ def overview_table(title: str, record: dict[str, Any]) -> Table:
 
 
 def table_of(title: str, columns: Sequence[str], numbers: Sequence[str]) -> Table:
-    """An empty table for the terminal; the columns of numbers are to the right."""
+    """An empty table for the terminal, with right-aligned columns of numbers last."""
     table = Table(title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         table.add_column(column, justify="right" if column in numbers else "left", no_wrap=True)

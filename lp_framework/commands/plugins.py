@@ -22,7 +22,7 @@ down."""
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the tables; in a pipe, one line for each name with nothing cut off."""
+    """Print the tables; when piped, one untruncated line per name."""
     if {"--help", "-h"} & set(arguments):
         print(USAGE)
         return
@@ -53,6 +53,6 @@ def _table(group: str) -> Table:
 
 
 def _assignment(lines: Sequence[str]) -> str:
-    """`key=value` of the lines of a setting, without its comment."""
+    """`key=value` from the lines of a setting, without its comment."""
     key, _, value = next(line for line in lines if not line.startswith("#")).partition(" #")[0].partition(": ")
     return f"{key}={value.strip()}"

@@ -11,7 +11,7 @@ from lp_framework.errors import UserError
 
 
 def run(config: DictConfig) -> None:
-    """Render the objects of `data` that are not there yet."""
+    """Render the objects of `data` not rendered yet."""
     source = Components(plain(config))["data"].source
     if not isinstance(source, RenderedData):
         choices = [name for name in registry.names("data") if issubclass(registry.get("data", name), RenderedData)]

@@ -1,4 +1,4 @@
-"""`report`: finished runs as one page; evaluations as tables and figures, too, beside the paper's numbers."""
+"""`report`: finished runs on one page; evaluations also as tables and figures beside the paper's numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lp_framework.report.sweep_tables import Objects, counted, sweep_sections, s
 
 
 def run(config: DictConfig) -> None:
-    """Gather the runs and write `report.html` and, of evaluations, `report.md`, `.csv`, `.json` and figures."""
+    """Gather the runs and write `report.html` and, for evaluations, `report.md`, `.csv`, `.json` and figures."""
     objects: Objects = registry.checked(sweep_tables, {"objects": config.objects}, "")["objects"]
     folders = [Path(str(each)) for each in (config.runs if isinstance(config.runs, ListConfig) else [config.runs])]
     found, left_out = find_runs(folders)

@@ -1,4 +1,4 @@
-"""`train`: fit a model of the relative pose; a killed run goes on with `resume=RUN_FOLDER`."""
+"""`train`: fit a model of the relative pose; `resume=RUN_FOLDER` resumes a killed run."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from lp_framework.report.runs import saved_config
 from lp_framework.viz.curves import save_training_picture
 
 METRICS = "metrics.csv"
-OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, without use in eval
+OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, not used by eval
 
 
 def run(config: DictConfig) -> None:
-    """Train into this run's folder, or go on in the folder that `resume` names, or where this very run was stopped."""
+    """Train into this run's folder. Resumes the run in the folder `resume`, or this run if it was stopped."""
     folder = building.run_folder() if config.resume is None else Path(config.resume)
     saved, last = folder / "config.yaml", folder / FOLDER / LAST
     begun = last.is_file()
     if config.resume is not None:
         if not begun:
             raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
-        # A run may be prolonged or moved to other devices.
+        # A run may be extended or moved to other devices.
         config = building.with_overrides(OmegaConf.create(saved_config(saved)), config, ("trainer",), saved)
-    elif begun and saved_config(saved) != building.plain(config):  # what was learned is not overwritten
+    elif begun and saved_config(saved) != building.plain(config):  # never overwrite another training
         raise UserError(
             f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
             "another hydra.run.dir"
@@ -90,14 +90,14 @@ def _check(settings: Mapping[str, Any]) -> None:
 
 
 def chosen_callbacks(settings: Mapping[str, Any], folder: Path) -> list[callbacks.Callback]:
-    """Lightning's own parts: checkpoints (best, last), early stopping, moving average, rates, progress."""
+    """Lightning's callbacks: checkpoints (best, last), early stopping, EMA, learning rate, progress."""
     validated = settings["data"]["validation_views"] > 0
     chosen: list[callbacks.Callback] = [callbacks.LearningRateMonitor("step"), callbacks.RichProgressBar(leave=False)]
     if settings["ema"] is not None:
         chosen.append(callbacks.EMAWeightAveraging(decay=settings["ema"]))
     if validated and settings["patience"] is not None:
         chosen.append(callbacks.EarlyStopping("val/loss", patience=settings["patience"]))
-    # A callback each: with `save_last` the last epoch would be kept only where it is the best one, too.
+    # Two callbacks: `save_last` alone would keep the last epoch only if it is also the best.
     for file, monitor, mode in ((BEST, "val/loss" if validated else None, "min"), (LAST, "epoch", "max")):
         named: dict[str, Any] = {"filename": Path(file).stem, "monitor": monitor, "mode": mode}
         chosen.append(
@@ -107,7 +107,7 @@ def chosen_callbacks(settings: Mapping[str, Any], folder: Path) -> list[callback
 
 
 def chosen_logger(settings: Mapping[str, Any], folder: Path) -> list[Logger]:
-    """Lightning's logger that is chosen besides `MetricsLogger`; `UserError` where its package is missing."""
+    """The Lightning logger chosen in addition to `MetricsLogger`; `UserError` if its package is missing."""
     install, name = "pip install 'lp_framework[loggers]'", settings.get("name")
     if name == "tensorboard":
         return [TensorBoardLogger(folder, name="tensorboard", version="")]
@@ -123,7 +123,7 @@ def chosen_logger(settings: Mapping[str, Any], folder: Path) -> list[Logger]:
 
 
 def next_command(settings: Mapping[str, Any], folder: str) -> str:
-    """The command that uses the trained model, on the data that it was trained on."""
+    """The command that uses the trained model, on the data it was trained on."""
     data = settings["data"]
     if not issubclass(registry.get("model", settings["model"]["name"]), PoseModel):
         return f"python -m lp_framework views prior.path={folder}"
@@ -138,7 +138,7 @@ def next_command(settings: Mapping[str, Any], folder: str) -> str:
 
 
 class MetricsLogger(Logger):
-    """`METRICS` in a run's folder, whole at any moment; of a run that goes on it keeps the rows up to its checkpoint's
+    """Logs to `METRICS` in a run's folder, always a complete file. A resumed run keeps the rows up to its checkpoint's
     step."""
 
     name = version = ""
@@ -152,25 +152,25 @@ class MetricsLogger(Logger):
                 self.rows += [row for row in csv.DictReader(content) if row["step"] and int(row["step"]) < steps]
 
     def log_hyperparams(self, *_: Any, **__: Any) -> None:
-        """They are in `config.yaml`."""
+        """Ignored: see `config.yaml`."""
 
     @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Add a row, which the file gets within a hundred steps."""
+        """Add a row; it is written to the file within 100 steps."""
         self.rows.append({**metrics, "step": step})
         if step is not None and (step + 1) % 100 == 0:
             self.save()
 
     @rank_zero_only
     def save(self) -> None:
-        """Write the file anew."""
+        """Rewrite the file."""
         columns = sorted({column for row in self.rows for column in row})
         if self.rows:
             write_csv(self.file, columns, [[row.get(column, "") for column in columns] for row in self.rows])
 
 
 def report(trainer: Trainer, folder: Path, settings: Mapping[str, Any], data: PairDataModule) -> None:
-    """`TRAINING` and the closing lines; the fingerprint is that of all training views."""
+    """Write `TRAINING` and print the summary. The fingerprint covers all training views."""
     losses = {key: value.item() for key, value in trainer.callback_metrics.items()}
     finite = {key: value for key, value in losses.items() if math.isfinite(value)}
     chosen = {key: settings[key] for key in ("model", "backbone", "seed")}
