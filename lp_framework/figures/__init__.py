@@ -1,4 +1,4 @@
-"""The paper's figures by name; importing the package registers them."""
+"""The paper's figures; importing the package registers them by name."""
 
 from lp_framework.figures import landscapes, results
 

@@ -1,4 +1,4 @@
-"""What every figure of the paper is: what it needs by name, what is analysed for it, and how that is drawn."""
+"""Base classes of the paper's figures: the components a figure needs, its analysis, and its drawing."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from lp_framework.solvers.base import NetworkUser, Pairs
 
 
 class PaperFigure(NetworkUser, ABC):
-    """A figure. A subclass's constructor declares what it needs by name (`data`, `prior`) and has its settings."""
+    """A figure. The constructor of a subclass declares components by name (`data`, `prior`) and its settings."""
 
     @abstractmethod
     def analyse(self, seed: int, device: torch.device) -> Any:
-        """The arrays of the figure; the data are prepared, the networks are on the device. Draws follow `seed`."""
+        """Compute the arrays of the figure, with data prepared and networks on the device. `seed` keys the draws."""
 
     @abstractmethod
     def draw(self, contents: Any) -> tuple[Figure, str]:
-        """The figure of what was found, and a caption: its panels, and the settings that its numbers depend on."""
+        """Draw the figure. Returns it with a caption: its panels, and the settings its numbers depend on."""
 
 
 @dataclass(kw_only=True)
 class PairsFigure(PaperFigure):
-    """A figure of pairs: of each object two test views, by number."""
+    """A figure of pairs: two test views of each object, by number."""
 
     data: PairDataModule
     reference: int = 0
     query: int = 1
 
     def pairs(self, objects: Sequence[str], device: torch.device) -> tuple[Pairs, list[ShownPair]]:
-        """See `named_pairs`; `UserError` for no objects."""
+        """See `named_pairs`; `UserError` if there are no objects."""
         if not objects:
             raise UserError("figure.objects needs the name of at least one object")
         return named_pairs(self.data, objects, [(self.reference, self.query)] * len(objects), device)
@@ -49,7 +49,7 @@ class PairsFigure(PaperFigure):
 
 @dataclass(kw_only=True)
 class EnergyFigure(PairsFigure):
-    """A figure of pairs and the prior's energy, which is the mean over `timesteps`, `noises` each."""
+    """A figure of pairs and the prior's energy, averaged over `timesteps` with `noises` each."""
 
     prior: Prior
     timesteps: Sequence[int] = (100, 300, 500, 700, 900)
@@ -60,9 +60,9 @@ class EnergyFigure(PairsFigure):
 
 
 def figure_model(kind: Literal["score", "energy"], path: str | None) -> PoseModel:
-    """The score or energy model of a training run or checkpoint; None: the score model that ships.
+    """Load the score or energy model of a training run or checkpoint; None for the bundled score model.
 
-    `UserError` for a model of the other kind, and where there is none, with the command that trains one.
+    `UserError` if the model is of the other kind, or if there is none; it then names the command to train one.
     """
     if path is None and kind == "energy":
         raise UserError(

@@ -1,4 +1,4 @@
-"""The prior's energy around objects, ways over it, and what it cannot tell; fields and densities side by side."""
+"""The prior's energy around objects, trajectories over it, and its failures; fields and densities side by side."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.twist import IFusion
 from lp_framework.viz import maps
 
-RESOLUTION = 256  # pixels a side of the views from a mesh
+RESOLUTION = 256  # pixels per side of the views from a mesh
 
 
 @register("figure", "landscapes")
 @dataclass
 class LandscapesFigure(EnergyFigure):
-    """Reference, query and the surface of the prior's energy for some objects: one valley, a plateau, two valleys."""
+    """Reference, query and the surface of the prior's energy for objects with one valley, a plateau and two valleys."""
 
     objects: Sequence[str] = ("robot", "celadon_bottle", "tram")
     latitude_step_degrees: float = 8.0
@@ -52,7 +52,7 @@ class LandscapesFigure(EnergyFigure):
         self.grid = landscape_grid(60.0, self.latitude_step_degrees, self.longitude_step_degrees)
 
     def analyse(self, seed: int, device: torch.device) -> list[ShownPair]:
-        """The landscapes of all pairs at once."""
+        """Compute the landscapes of all pairs at once."""
         pairs, shown = self.pairs(self.objects, device)
         return with_prior_energy(pairs, shown, self.prior, self.draws._replace(seed=seed), self.grid)
 
@@ -68,10 +68,10 @@ class LandscapesFigure(EnergyFigure):
 @register("figure", "trajectories")
 @dataclass
 class TrajectoriesFigure(EnergyFigure):
-    """iFusion's ways from longitudes 0, 90, 180 and 270 over the prior's landscape, and views generated on them.
+    """iFusion's trajectories from longitudes 0, 90, 180 and 270 over the prior's landscape, with generated views.
 
-    Each way has `views` generated views, the first at its start and the last at its end, by `sampling_steps` of DDIM at
-    a `guidance`; iFusion takes `steps`.
+    Each trajectory has `views` generated views, from its start to its end, by `sampling_steps` of DDIM with `guidance`.
+    iFusion takes `steps` steps.
     """
 
     object: str = "tram"
@@ -86,10 +86,10 @@ class TrajectoriesFigure(EnergyFigure):
             raise UserError(f"figure.views must be 2 to 5 generated views per trajectory, got {self.views}")
         self.solver = IFusion(self.prior, steps=self.steps)
         shares = [place / (self.views - 1) for place in range(self.views)]
-        self.shown_steps = [round(self.steps * share**2) for share in shares]  # most happens at first
+        self.shown_steps = [round(self.steps * share**2) for share in shares]  # most happens early on
 
     def analyse(self, seed: int, device: torch.device) -> tuple[ShownPair, NDArray]:
-        """The pair, solved once from all starts, and views `[N, K, H, W, 3]` at `shown_steps` of each trajectory."""
+        """Solve the pair from all starts, and generate views `[N, K, H, W, 3]` at `shown_steps` of each trajectory."""
         pairs, shown = self.pairs([self.object], device)
         shown = solved_pairs(pairs, shown, self.solver, Ring().make(pairs, seed), seed)
         (pair,) = with_prior_energy(pairs, shown, self.prior, self.draws._replace(seed=seed))
@@ -114,9 +114,9 @@ class TrajectoriesFigure(EnergyFigure):
 @register("figure", "failures")
 @dataclass
 class FailuresFigure(EnergyFigure):
-    """Views around ambiguous objects, from the mesh (where the data have one) and by the prior, beside the landscape.
+    """Views around ambiguous objects, from the mesh (if the data have one) and by the prior, beside the landscape.
 
-    `views` longitudes evenly around, the first is the reference's own, by `sampling_steps` of DDIM at a `guidance`.
+    Shows `views` evenly spaced longitudes, starting with the reference's, by `sampling_steps` of DDIM with `guidance`.
     """
 
     objects: Sequence[str] = ("lotus_vase", "soup_can")
@@ -130,7 +130,7 @@ class FailuresFigure(EnergyFigure):
             raise UserError(f"figure.views must be 2 to 12 around the object, got {self.views}")
 
     def analyse(self, seed: int, device: torch.device) -> list[maps.FailureRow]:
-        """The landscapes of all pairs at once, the views an object after the other."""
+        """Compute the landscapes of all pairs at once, the views one object at a time."""
         pairs, shown = self.pairs(self.objects, device)
         around = torch.zeros(self.views, 3)
         around[:, 1] = torch.arange(self.views) * (2 * math.pi / self.views)
@@ -146,8 +146,8 @@ class FailuresFigure(EnergyFigure):
         return rows
 
     def rendered(self, pair: ShownPair, poses: Tensor) -> NDArray | None:
-        """Views `[K, H, W, 3]` in [0, 1] of a pair's object from view poses `[K, 3]`, with the reference's field of
-        view; None where there is no mesh."""
+        """Render views `[K, H, W, 3]` in [0, 1] of a pair's object at view poses `[K, 3]`, with the reference's field
+        of view; None if there is no mesh."""
         source = self.data.source
         if not isinstance(source, RenderedData):
             return None
@@ -173,7 +173,7 @@ SPACING = 20.0  # degrees, of arrows
 def three_fields(
     score: PoseModel, energy: PoseModel, pairs: Pairs, shown: Sequence[ShownPair]
 ) -> list[tuple[Arrows, ...]]:
-    """A pair's exact field, and those of a score and an energy model in its scale, for each of the pairs."""
+    """For each pair, the exact field and those of a score and an energy model, scaled to the exact one."""
     truth = truths(shown)
     models = (fields.ExactModel(score.kernel, truth), score, energy)
     found = zip(*(fields.model_arrows(model, pairs, truth[:, 2], SPACING) for model in models), strict=True)
@@ -183,9 +183,9 @@ def three_fields(
 @register("figure", "toy")
 @dataclass
 class ToyFigure(EnergyFigure):
-    """The seven panels of the Toy Example: score fields and densities of one pair, exact, learned and of the prior.
+    """The seven panels of the Toy Example: exact, learned and prior score fields and densities of one pair.
 
-    `score` and `energy` are training runs or checkpoints; None for the score model that ships.
+    `score` and `energy` are training runs or checkpoints; None for the bundled score model.
     """
 
     object: str = "tram"
@@ -197,7 +197,7 @@ class ToyFigure(EnergyFigure):
         self.energy_model, self.score_model = figure_model("energy", self.energy), figure_model("score", self.score)
 
     def analyse(self, seed: int, device: torch.device) -> tuple[ShownPair, dict[str, Landscape]]:
-        """A pair with four maps of score fields, and exp(-E) of both energies by title, at the true relative radius."""
+        """The pair with four maps of score fields, and exp(-E) of both energies by title, at the true radius."""
         pairs, (pair,) = self.pairs([self.object], device)
         radius, grid, cells = truths([pair])[:, 2], landscape_grid(), cell_grid(SPACING)
         ((exact, score, energy),) = three_fields(self.score_model, self.energy_model, pairs, [pair])
@@ -228,9 +228,9 @@ class ToyFigure(EnergyFigure):
 @register("figure", "score_vs_energy")
 @dataclass
 class ScoreVsEnergyFigure(PairsFigure):
-    """Density and score field of an energy model beside the field of a score model, for a pair of each object.
+    """Density and score field of an energy model beside the field of a score model, for one pair per object.
 
-    `score` and `energy` are training runs or checkpoints; None for the score model that ships.
+    `score` and `energy` are training runs or checkpoints; None for the bundled score model.
     """
 
     objects: Sequence[str] = ("tram", "duck", "watering_can")
@@ -241,7 +241,7 @@ class ScoreVsEnergyFigure(PairsFigure):
         self.energy_model, self.score_model = figure_model("energy", self.energy), figure_model("score", self.score)
 
     def analyse(self, seed: int, device: torch.device) -> list[ShownPair]:
-        """Three maps a pair, at its true relative radius; nothing is drawn at random."""
+        """Compute three maps per pair, at its true relative radius; deterministic."""
         pairs, shown = self.pairs(self.objects, device)
         energies = fields.model_landscapes(self.energy_model, pairs, truths(shown)[:, 2], landscape_grid())
         learned = three_fields(self.score_model, self.energy_model, pairs, shown)

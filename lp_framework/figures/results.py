@@ -1,4 +1,4 @@
-"""What solvers find: cameras beside the true ones, and recall against the number of random starts."""
+"""Results of solvers: predicted and true cameras, and recall over the number of random starts."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from lp_framework.report.sweep_figures import is_swept, sweep_figure
 from lp_framework.report.sweep_tables import OVER, Objects, SweepTable, sweep_tables
 from lp_framework.viz.cameras import CameraScene, camera_methods_figure
 
-NAMES = {"ifusion": "iFusion", "id_pose": "ID-Pose", "two_stage": "two-stage"}  # as papers write them
+NAMES = {"ifusion": "iFusion", "id_pose": "ID-Pose", "two_stage": "two-stage"}  # as written in papers
 
 
 @register("figure", "cameras")
 @dataclass
 class CamerasFigure(PaperFigure):
-    """True and predicted cameras around some objects, methods side by side, from a few random starts for each view.
+    """True and predicted cameras around some objects, methods side by side, from a few random starts per view.
 
-    The first test view of an object is the reference, the next `targets`, or all that there are, are estimated.
-    `methods` are solvers by name with their default settings; those that ask for a model get that of `score`, a
-    training run or a checkpoint.
+    The first test view of an object is the reference; the next `targets` views (or as many as exist) are estimated.
+    `methods` are names of solvers, used with their default settings. Solvers that need a model use the one from
+    `score`, a training run or a checkpoint.
     """
 
     data: PairDataModule
@@ -58,7 +58,7 @@ class CamerasFigure(PaperFigure):
         self.named = [NAMES.get(name, words(name)) for name in self.methods]
 
     def analyse(self, seed: int, device: torch.device) -> list[CameraScene]:
-        """All objects and views are solved together, a method after the other."""
+        """Solve all objects and views together, one method at a time."""
         views = [self.data.table("test").objects[object_index(self.data, name)] for name in self.objects]
         targets = max(1, min(self.targets, *(len(each) - 1 for each in views)))
         objects = [name for name in self.objects for _ in range(targets)]
@@ -97,17 +97,17 @@ EXPERIMENT, COUNT = "starts", "start.count"
 @register("figure", "recall")
 @dataclass
 class RecallFigure(PaperFigure):
-    """Recall within 30 degrees against the number of random starts and against time, a curve a solver.
+    """Recall within 30 degrees over the number of random starts and over time, one curve per solver.
 
-    `runs` is a folder with finished jobs of `eval experiment=starts`; `objects` says whether all objects count, or
-    only those with a unique answer.
+    `runs` is a folder with finished jobs of `eval experiment=starts`; `objects` chooses all objects or only those
+    with a unique answer.
     """
 
     runs: str = "runs/multirun/eval/starts"
     objects: Objects = "unique_answer"
 
     def analyse(self, seed: int, device: torch.device) -> SweepTable:
-        """The table of the experiment; nothing is drawn at random."""
+        """Read the table of the experiment; deterministic."""
         make = f"`python -m lp_framework eval experiment={EXPERIMENT}` makes them"
         if not Path(self.runs).is_dir():
             raise UserError(f"figure.runs={self.runs}: there is no such folder of finished runs; {make}")

@@ -1,1 +1,1 @@
-"""Pictures: every plotting function takes arrays and returns a matplotlib `Figure`."""
+"""Plotting: every plotting function takes arrays and returns a matplotlib `Figure`."""

@@ -1,4 +1,4 @@
-"""Cameras around their object: those of some photographs, with the images in place, and those that methods predict."""
+"""Cameras around their object: those of photographs, with the images in place, and predictions of several methods."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from lp_framework.data.photographs import on_white
 from lp_framework.geometry import camera_to_world
 from lp_framework.viz import style
 
-ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; from where we look, the second relative to the reference
-NEAR_BY = 0.34  # how far from a camera its image is drawn, as a share of the largest radius
-LARGEST = 128  # pixels a side of an image in the scene, but for the one in the middle
+ELEVATION, OFFSETS = 28.0, range(-60, 61, 5)  # degrees; our own viewpoint, longitudes relative to the reference
+NEAR_BY = 0.34  # distance from a camera to its image, as a share of the largest radius
+LARGEST = 128  # pixels per side of an image in the scene, except the one in the middle
 MOST_CARDS, CARD_COLUMNS = 12, 6
-TRUSTED = {"trust": style.GREEN, "doubtful": style.ORANGE, "do not trust": style.VERMILION}  # a colour a verdict
+TRUSTED = {"trust": style.GREEN, "doubtful": style.ORANGE, "do not trust": style.VERMILION}  # one colour per verdict
 
-# Of the figure of methods.
+# For the figure of methods.
 RED, SKY = "#D7191C", "#56B4E9"
-TARGETS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, style.MUTED)  # a colour a target view
+TARGETS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, SKY, style.MUTED)  # one colour per target view
 FRUSTUM = 0.2  # of the largest radius
-# True cameras are wide and light, so that a predicted one on them can be seen.
+# True cameras are wide and light, so that predicted ones stay visible on top of them.
 TRUE: dict[str, Any] = {"linewidth": 2.4, "alpha": 0.55}
 PREDICTED: dict[str, Any] = {"linewidth": 0.9}
 IMAGE_COLUMNS = 3
 
 
 def viewpoint(latitude: float, longitude: float) -> NDArray:
-    """Axes `[3, 3]` of a parallel projection from far away (radians): columns to the right, up, and towards us."""
+    """Axes `[3, 3]` of an orthographic projection from angles in radians: columns point right, up, and towards us."""
     return np.asarray(camera_to_world(torch.tensor([latitude, longitude, 1.0], dtype=torch.float64))[:3, :3])
 
 
 def best_viewpoint(poses: NDArray) -> NDArray:
-    """The viewpoint near the first of the view poses `[V, 3]` from which the cameras appear furthest apart."""
-    # Where charges, one at each camera, one where its image is drawn, and four at the object, have least energy.
+    """The viewpoint near the first of the view poses `[V, 3]` that separates the cameras best."""
+    # Minimize the energy of charges: one per camera, one where its image is drawn, and four at the object.
     centres = _cameras(poses)[:, :3, 3]
     points = np.concatenate([np.zeros((4, 3)), centres, centres * (1 - NEAR_BY)])
     viewpoints = [viewpoint(math.radians(ELEVATION), poses[0, 1] + math.radians(offset)) for offset in OFFSETS]
@@ -53,8 +53,8 @@ def best_viewpoint(poses: NDArray) -> NDArray:
 
 
 def image_plane(camera: NDArray, distance: float, half_angle: float) -> NDArray:
-    """Corners `[4, 3]` of what a camera `[4, 4]` sees at a distance: lower left, lower right, upper right, upper left;
-    `half_angle` is half of its field of view (radians).
+    """Corners `[4, 3]` of the view of a camera `[4, 4]` at a distance: lower left, lower right, upper right, upper
+    left; `half_angle` is half of its field of view (radians).
     """
     side = distance * math.tan(half_angle)
     corners = np.array([[-side, -side], [side, -side], [side, side], [-side, side]])
@@ -62,7 +62,7 @@ def image_plane(camera: NDArray, distance: float, half_angle: float) -> NDArray:
 
 
 def _cameras(poses: NDArray) -> NDArray:
-    """Camera-to-world matrices `[K, 4, 4]` of those view poses `[..., 3]` that are finite."""
+    """Camera-to-world matrices `[K, 4, 4]` of the finite view poses among `[..., 3]`."""
     return np.asarray(camera_to_world(torch.from_numpy(poses[np.isfinite(poses).all(axis=-1)])))
 
 
@@ -74,7 +74,7 @@ ROUND, SPOKES = (
 
 
 class Scene:
-    """What is seen from a viewpoint of the ground, the plane of latitude 0 out to `radius`, and of what is on it."""
+    """The ground (the plane of latitude 0 out to `radius`) and what is on it, seen from a viewpoint."""
 
     def __init__(self, axes: Axes, view: NDArray, radius: float) -> None:
         self.axes, self.view, self.radius = axes, view, radius
@@ -88,15 +88,15 @@ class Scene:
         axes.add_collection(LineCollection(spokes, colors=style.FAINT, linewidths=0.4, zorder=1.1))
 
     def project(self, points: NDArray) -> NDArray:
-        """Where points `[..., 3]` appear, `[..., 2]` (right, up; scene units)."""
+        """Project points `[..., 3]` to `[..., 2]` (right, up; scene units)."""
         return points @ self.view[:, :2]
 
     def nearness(self, points: NDArray) -> NDArray:
-        """How near points `[..., 3]` are to us, `[...]`, in units of the radius."""
+        """How close points `[..., 3]` are to us, `[...]`, in units of the radius."""
         return points @ self.view[:, 2] / self.radius
 
     def image(self, image: Image.Image, plane: NDArray, order: float) -> None:
-        """An image in its plane (as `image_plane`); nothing where that is seen edge-on."""
+        """Draw an image in its plane (see `image_plane`); nothing if it is seen edge-on."""
         corners = self.project(plane)
         right, up = corners[1] - corners[0], corners[3] - corners[0]
         if abs(right[0] * up[1] - right[1] * up[0]) < 1e-3 * (right @ right + up @ up):
@@ -105,14 +105,14 @@ class Scene:
         self.axes.imshow(image, extent=(0, 1, 0, 1), transform=placed, interpolation="bilinear", zorder=order)
 
     def frustum(self, centre: NDArray, plane: NDArray, **line: Any) -> None:
-        """The edges of a camera's pyramid, from its centre to its image's plane."""
+        """Draw the edges of a camera's frustum, from its centre to its image plane."""
         apex, corners = self.project(centre), self.project(plane)
         edges = [np.stack([apex, corner]) for corner in corners] + [np.concatenate([corners, corners[:1]])]
         self.axes.add_collection(LineCollection(edges, capstyle="round", joinstyle="round", **line))
 
 
 def shrunk(image: Image.Image) -> Image.Image:
-    """The image with at most `LARGEST` pixels a side; colours are weighted by opacity."""
+    """The image with at most `LARGEST` pixels per side; colours are weighted by opacity."""
     small = image.copy()
     small.thumbnail((LARGEST, LARGEST))
     return small
@@ -123,9 +123,9 @@ def cameras_figure(
     poses: NDArray, images: Sequence[Image.Image], numbers: Sequence[int], titles: Sequence[str],
     field_of_view_degrees: float, verdicts: Sequence[str] = (),
 ) -> Figure:  # fmt: skip
-    """Cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title, and below them the
-    images (the first `MOST_CARDS`) with their poses, and with `verdicts` on them (a key of `TRUSTED`, or nothing). The
-    first is the reference; its image also stands for the object.
+    """Draw cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title. Below are the
+    first `MOST_CARDS` images with their poses and `verdicts` (keys of `TRUSTED`, or empty). The first image is the
+    reference and also stands for the object.
     """
     verdicts = verdicts or [""] * len(images)
     cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())
@@ -176,8 +176,8 @@ def _badge(colour: str) -> dict[str, Any]:
 
 
 class CameraScene(NamedTuple):
-    """One object: images (RGBA), view poses `[V, 3]` and fields of view `[V]` (radians), the reference's first; of each
-    method the predicted view poses `[V - 1, N, 3]` of the others from N starts, and a word on how good they are.
+    """One object: images (RGBA), view poses `[V, 3]` and fields of view `[V]` (radians), the reference first; per
+    method, the view poses `[V - 1, N, 3]` predicted for the others from N starts, and a short summary of their quality.
     """
 
     title: str
@@ -190,7 +190,7 @@ class CameraScene(NamedTuple):
 
 @style.styled
 def camera_methods_figure(objects: Sequence[CameraScene], methods: Sequence[str]) -> Figure:
-    """A row an object: its images, the reference framed in red, and a scene a method; true cameras are bold."""
+    """One row per object: its images, the reference framed in red, and one scene per method; true cameras are bold."""
     figure = Figure(figsize=(7.0, 0.3 + 1.7 * len(objects)), layout="constrained")
     parts = style.stacked(figure, *[1] * len(objects))
     for row, (each, part) in enumerate(zip(objects, parts, strict=True)):
@@ -227,5 +227,5 @@ def _draw_method(scene: Scene, content: CameraScene, predicted: NDArray) -> None
 
 
 def colour_of(index: int) -> str:
-    """The colour of a view: red for the reference, one of its own for each other."""
+    """The colour of a view: red for the reference, a different one for each other view."""
     return TARGETS[(index - 1) % len(TARGETS)] if index else RED

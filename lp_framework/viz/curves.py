@@ -1,4 +1,4 @@
-"""Figures of curves: errors of an evaluation, losses of a training, the energy around objects."""
+"""Figures with curves: errors of an evaluation, losses of a training run, the energy around objects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS, TRANSLATION_THRESHOLD
 from lp_framework.viz import style
 
-NEAREST = 0.01  # scene units; where the logarithmic axis of translation errors begins
+NEAREST = 0.01  # scene units; start of the logarithmic axis of translation errors
 DASHED: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (3, 2)), "zorder": 2}
 LOSSES = {"train/loss": (style.BLUE, "training loss"), "val/loss": (style.VERMILION, "validation loss"),
           "train/view_loss": (style.GREEN, "training, view readout")}  # fmt: skip
@@ -26,9 +26,9 @@ COLUMNS = 4  # of objects
 
 
 def cumulative(errors: NDArray, end: float) -> tuple[NDArray, NDArray]:
-    """The share of `errors` `[E]` that are at most x, as a staircase from 0 to `end`: x and share `[U]`.
+    """Empirical cumulative distribution of `errors` `[E]` from 0 to `end`: x and the share of errors <= x, `[U]` each.
 
-    Between two points the share is that of the point before (`drawstyle="steps-post"`). What is NaN is never reached.
+    Draw it as a step function (`drawstyle="steps-post"`). NaN counts as an error beyond any x.
 
     >>> cumulative(np.array([3.0, 1.0, np.nan, 3.0]), 180.0)
     (array([  0.,   1.,   3., 180.]), array([0.  , 0.25, 0.75, 0.75]))
@@ -41,9 +41,9 @@ def cumulative(errors: NDArray, end: float) -> tuple[NDArray, NDArray]:
 
 @style.styled
 def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, classes: Sequence[str]) -> Figure:
-    """Share of pairs within an error, a curve an ambiguity class: the chosen start and, dashed, all of several.
+    """Share of pairs within an error, one curve per ambiguity class: the chosen start and, dashed, all starts if N > 1.
 
-    `rotation` (degrees) and `translation` (scene units) `[P, N]`, the chosen start `[P]`, and every pair's class `[P]`.
+    Takes `rotation` (degrees) and `translation` (scene units) `[P, N]`, the chosen start `[P]`, and the class `[P]`.
     """
     figure = Figure(figsize=(8.0, 3.5))
     figure.set_layout_engine("constrained", wspace=0.06)
@@ -62,7 +62,7 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
     if several:
         keys.append(Line2D([], [], color=style.INK, label="chosen start"))
         keys.append(Line2D([], [], color=style.INK, label=f"all {rotation.shape[1]} starts", **DASHED))
-    # Small errors matter most: a square-root axis gives them room and still begins at 0.
+    # Small errors matter most: a square-root axis gives them room and still starts at 0.
     left.set_xscale(
         "function", functions=(lambda x: np.sign(x) * np.sqrt(np.abs(x)), lambda x: np.sign(x) * np.square(x))
     )
@@ -87,7 +87,7 @@ def errors_figure(rotation: NDArray, translation: NDArray, chosen: NDArray, clas
 
 @style.styled
 def calibration_figure(bins: Sequence[Mapping[str, float]], title: str) -> Figure:
-    """Share of right answers against their probability, of `evaluation.breakdown`'s bins; areas tell their pairs."""
+    """Share of correct answers over their probability, for bins of `evaluation.breakdown`; areas show pair counts."""
     figure = Figure(figsize=(4.4, 4.4), layout="constrained")
     axes = figure.subplots()
     probability, right, pairs = (np.array([each[key] for each in bins]) for key in ("probability", "right", "pairs"))
@@ -112,7 +112,7 @@ class Curve(NamedTuple):
 
 
 def read_losses(path: Path) -> tuple[dict[str, Curve], Curve | None]:
-    """The curves of `LOSSES` and the learning rate in Lightning's `metrics.csv`; none where there is no such file."""
+    """Read the curves of `LOSSES` and the learning rate from Lightning's `metrics.csv`; none without this file."""
     gathered: dict[str, list[tuple[float, float]]] = {}
     if path.is_file():
         with path.open(newline="", encoding="utf-8") as file:
@@ -126,13 +126,13 @@ def read_losses(path: Path) -> tuple[dict[str, Curve], Curve | None]:
 
 
 def save_training_picture(folder: Path) -> list[Path]:
-    """`training.png` and `.pdf` in a training run's folder, from its `metrics.csv`; none where nothing was logged."""
+    """Draw `training.png` and `.pdf` from the `metrics.csv` in a training run's folder; none if nothing was logged."""
     losses, rate = read_losses(folder / "metrics.csv")
     return style.save_figure(training_figure(losses, rate), folder / "training")[:1] if losses else []
 
 
 def running_mean(values: NDArray, window: int) -> NDArray:
-    """Mean of the `window` values around each of `values` `[S]`; of fewer at the ends.
+    """Mean of the `window` values around each of `values` `[S]`; fewer at the ends.
 
     >>> running_mean(np.array([1.0, 2.0, 6.0, 4.0]), 3)
     array([1.5, 3. , 4. , 5. ])
@@ -143,7 +143,7 @@ def running_mean(values: NDArray, window: int) -> NDArray:
 
 @style.styled
 def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
-    """The losses by their logged names on a log scale, and below them the learning rate where there is one."""
+    """Plot the losses by their logged names on a log scale, and below them the learning rate, if any."""
     figure = Figure(figsize=(8.0, 3.0 if rate is None else 3.8), layout="constrained")
     heights = [1.0] if rate is None else [3.2, 1.0]
     above, *below = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
@@ -151,7 +151,7 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
         colour, label = LOSSES[name]
         window = len(curve.step) // 20
         if window > 1:
-            # Single batches scatter: they stay visible, pale, behind their running mean.
+            # Losses of single batches are noisy: draw them pale, behind their running mean.
             above.plot(*curve, color=colour, marker=".", markersize=2.5, linestyle="none", alpha=0.3, zorder=1)
             curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean of {window} records"
         marker = "" if len(curve.step) > 30 else "o"
@@ -181,7 +181,7 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
 
 @style.styled
 def azimuth_figure(objects: Sequence[Mapping[str, Any]]) -> Figure:
-    """A panel an object; the truth is marked, and the share of pairs whose least energy is within 15 degrees of it.
+    """One panel per object, with the truth and the share of pairs whose lowest energy is within 15 degrees of it.
 
     Each has `object` (name), `ambiguity`, that share as `within`, and its mean `energy` over `degrees` from the truth.
     """
@@ -192,7 +192,7 @@ def azimuth_figure(objects: Sequence[Mapping[str, Any]]) -> Figure:
     for axes, each in zip(grid.flat, objects, strict=False):
         style.open_frame(axes)
         axes.axvline(0, color=style.TRUTH, linewidth=2.5, alpha=0.8, zorder=1)
-        # The circle is closed: what is at -180 is at 180 as well.
+        # Close the circle: -180 and 180 are the same.
         place = [*each["degrees"], each["degrees"][0] + 360]
         above = np.array([*each["energy"], each["energy"][0]]) - min(each["energy"])
         axes.plot(place, above, color=style.CLASS_COLOURS[each["ambiguity"]], zorder=3)

@@ -1,6 +1,6 @@
-"""Maps of relative latitude and longitude, and in 3-D: energies, scores, and the ways that a solver took over them.
+"""Maps over relative latitude and longitude, and surfaces: energies, scores, and the trajectories of a solver.
 
-Of one pair with its images, and the paper's figures of several.
+For one pair with its images, and for the paper's figures of several pairs.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from lp_framework.analysis.landscapes import FLAT, Landscape, LandscapeMinimum
 from lp_framework.analysis.pairs import PoseMap, ShownPair
 from lp_framework.viz import style
 
-SEAM = 0.5  # degrees; what is nearer to the seam is drawn on both sides of it
-# From dark valleys to light heights, evenly in lightness, so that grey and any kind of colour vision see the same.
+SEAM = 0.5  # degrees; points closer to the seam are drawn on both sides of it
+# Dark valleys to light peaks, even in lightness, so that it works in grey and for any kind of colour vision.
 RELIEF = "cividis"
 LEVELS = 9  # contour lines
 
-WIDTH = 7.0  # inches, of the paper's figures
+WIDTH = 7.0  # of the paper's figures, inches
 COLUMNS = 3  # of surfaces
 
 
@@ -46,8 +46,8 @@ MINIMUM_MARK = _mark("+", 9, style.INK, "white", 1.3, path_effects=[withStroke(l
 
 
 def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: float = 60.0) -> ScalarMappable | None:
-    """Draw a map, latitudes within `limit` degrees or those of the relief, and the true relative pose `[3]`; returns
-    what a colour bar of its relief or its arrows needs.
+    """Draw a map and the true relative pose `[3]`. Latitudes are those of the relief, or within `limit` degrees.
+    Returns what a colour bar of the relief or the arrows needs.
     """
     axes.set_title(content.title, pad=3)
     axes.spines[:].set(color=style.FAINT)
@@ -68,7 +68,7 @@ def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: 
         drawn = axes.quiver(
             longitude, latitude, score[..., 1], score[..., 0], content.arrows.lengths(),
             cmap=style.MAGNITUDE, norm=Normalize(0, scale), angles="xy", scale_units="xy",
-            scale=scale * len(longitude) / (1.15 * 360),  # the longest is about as long as columns are apart
+            scale=scale * len(longitude) / (1.15 * 360),  # the longest arrow is about as long as a column is wide
             pivot="mid", units="inches", width=0.0125, headwidth=4, headlength=4.5, headaxislength=4,
             minlength=0.5, zorder=1,
         )  # fmt: skip
@@ -108,18 +108,18 @@ def _draw_ways(axes: Axes, ways: ShownPair, limit: float) -> None:
 
 def _points(axes: Axes, poses: NDArray, limit: float, **mark: Any) -> None:
     latitude, longitude = np.rad2deg(poses[:, 0]), np.rad2deg(poses[:, 1]) % 360
-    # What lies on the seam is on both edges of the map, and none of its mark is cut off there.
+    # Points on the seam appear on both edges of the map, and their marks are not clipped.
     for shift in (0.0, 360.0, -360.0):
         shown = (np.abs(latitude) <= limit) & (np.abs(longitude + shift - 180) <= 180 + SEAM)
-        if shown.any():  # an empty line that is not clipped would take all of the layout's room
+        if shown.any():  # an empty unclipped line would break the layout
             axes.plot(longitude[shown] + shift, latitude[shown], clip_on=False, **mark)
 
 
 def broken_at_seam(latitude: NDArray, longitude: NDArray) -> tuple[NDArray, NDArray]:
-    """A path `[S]`, `[S]` (degrees) as a line on the map 0..360: (latitude, longitude), both `[S + 3 K]`.
+    """Convert a path `[S]`, `[S]` (degrees) to a line on the map 0..360: (latitude, longitude), both `[S + 3 K]`.
 
-    Each of the K times that the path crosses the seam the line runs up to one edge of the map, breaks (NaN), and goes
-    on from the other edge. From one point to the next the path takes the shorter way around.
+    At each of K crossings of the seam, the line runs to one edge of the map, breaks (NaN), and continues from the
+    other edge. Consecutive points are joined the shorter way around.
 
     >>> broken_at_seam(np.array([0.0, 4.0]), np.array([350.0, 370.0]))
     (array([ 0.,  2., nan,  2.,  4.]), array([350., 360.,  nan,   0.,  10.]))
@@ -139,31 +139,31 @@ def broken_at_seam(latitude: NDArray, longitude: NDArray) -> tuple[NDArray, NDAr
 
 
 def closed(landscape: Landscape) -> tuple[NDArray, NDArray, NDArray]:
-    """Latitudes `[A]` and longitudes `[O + 1]` in degrees, and energies `[A, O + 1]`: 360 degrees is 0 again."""
+    """Latitudes `[A]`, longitudes `[O + 1]` (degrees) and energies `[A, O + 1]`, with longitude 0 repeated at 360."""
     energy = landscape.energy.double().cpu().numpy()
     latitude, longitude = (np.rad2deg(each.double().cpu().numpy()) for each in landscape[:2])
     return latitude, np.append(longitude, 360.0), np.concatenate([energy, energy[:, :1]], axis=1)
 
 
 def marked_minima(landscape: Landscape) -> list[LandscapeMinimum]:
-    """The minima that are marked: none on a plateau, where any place along the longitude would do."""
+    """The minima to mark: none on a plateau, where all longitudes are equally good."""
     return landscape.minima() if landscape.flatness() < FLAT else []
 
 
 def minima_in_words(landscape: Landscape) -> str:
-    """How many minima there are, or that it is a plateau."""
+    """The number of minima in words, or "plateau"."""
     count = len(landscape.minima())
     return "plateau" if landscape.flatness() >= FLAT else f"{count} minim{'um' if count == 1 else 'a'}"
 
 
 def small_marks(axes: Axes) -> None:
-    """The marks of a large map made fit for a small one."""
+    """Shrink the marks of a large map for a small one."""
     for line in axes.lines:
         line.set_markersize(0.75 * line.get_markersize())
 
 
 def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
-    """The key's entries, for what is drawn."""
+    """Legend entries for what is drawn."""
     ways = [each.ways for each in maps if each.ways is not None]
     entries: list[tuple[bool, str, dict[str, Any]]] = [
         (truth is not None, "true pose", TRUTH_MARK),
@@ -179,8 +179,8 @@ def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
 def pair_figure(
     pair: ShownPair, maps: Sequence[PoseMap], title: str, note: str, views: Sequence[NDArray] = ()
 ) -> Figure:
-    """Both images of a pair beside maps in one scale, and below these `views`, `[H, W, 3]` each, which the prior
-    generates at the ends: the paper's Figure 2.
+    """Both images of a pair beside maps in one scale, and below them the prior's `views` at the ends, `[H, W, 3]`
+    each: the paper's Figure 2.
     """
     limit = _limit(pair.truth, maps)
     rows, high = -(-len(views) // 5), len(maps) * (0.4 + 5.0 * limit / 180) + 0.5
@@ -212,7 +212,7 @@ def pair_figure(
 
 @style.styled
 def surface_figure(landscape: Landscape, truth: NDArray | None = None, title: str = "") -> Figure:
-    """The landscape in 3-D over its own map; the true relative pose `[3]` (radians) is marked on both."""
+    """The landscape as a surface above its own map; the true relative pose `[3]` (radians) is marked on both."""
     figure = Figure(figsize=(4.8, 3.6))
     figure.suptitle(title, x=0.02, ha="left", fontsize=10, fontweight="bold")
     _draw_surface(figure.add_axes((-0.02, -0.03, 0.98, 1.05), projection="3d"), landscape, truth)
@@ -220,13 +220,13 @@ def surface_figure(landscape: Landscape, truth: NDArray | None = None, title: st
 
 
 def small_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> None:
-    """A landscape as a small surface, in its own range."""
+    """Draw a landscape as a small surface, scaled to its own range."""
     _draw_surface(axes, landscape, truth)
     axes.set(xlabel="", ylabel="", zlabel="", xticks=[0, 90, 180, 270], yticks=[-30, 30])
     axes.patch.set_visible(False)
     axes.tick_params(labelsize=6, pad=-4)
     axes.locator_params(axis="z", nbins=3)
-    axes.set_box_aspect((2.0, 1.2, 0.95), zoom=1.2)  # axes in 3-D leave wide margins
+    axes.set_box_aspect((2.0, 1.2, 0.95), zoom=1.2)  # 3-D axes leave wide margins
     axes.set_in_layout(False)
     small_marks(axes)
 
@@ -266,14 +266,14 @@ def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> 
 
 
 def ends_in_words(pair: ShownPair) -> list[tuple[str, str]]:
-    """For every end of a pair the longitude of its start, and the rotation error, or empty where not known."""
+    """For every end of a pair, the longitude of its start and the rotation error; empty if unknown."""
     starts = ["" if longitude is None else f"{longitude:.0f}°" for longitude in pair.start_longitudes()]
     errors = ["" if np.isnan(error) else f"{error:.0f}° off" for error in pair.rotation_errors]
     return list(zip(starts, errors, strict=True))
 
 
 def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:
-    """The greatest latitude (degrees) of the landscape, or of 60 and up one that shows the truth and every answer."""
+    """The landscape's greatest latitude (degrees); without one, at least 60 and enough to show truth and answers."""
     if (relief := maps[0].relief) is not None:
         return math.degrees(relief.latitude.abs().max().item())
     solved = [each.ways for each in maps if each.ways is not None and each.ways.chosen is not None]
@@ -284,7 +284,7 @@ def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:
 
 @style.styled
 def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
-    """A column a pair: reference and query above the surface of the prior's energy, whose height is its own range."""
+    """One column per pair: reference and query above the surface of the prior's energy, scaled to its own range."""
     rows = -(-len(pairs) // COLUMNS)
     figure = Figure(figsize=(WIDTH, 3.0 * rows), layout="constrained")
     places = figure.subfigures(rows, COLUMNS, squeeze=False).flat
@@ -302,7 +302,7 @@ def surfaces_figure(pairs: Sequence[ShownPair]) -> Figure:
 
 @style.styled
 def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -> Figure:
-    """(a), (b) both images; (c) a row a trajectory, of `views` `[N, K, H, W, 3]` at `steps`; (d) the landscape."""
+    """(a), (b) both images; (c) `views` `[N, K, H, W, 3]` at `steps`, one row per trajectory; (d) the landscape."""
     figure = Figure(figsize=(WIDTH, max(3.0, 0.4 + 0.65 * len(views))), layout="constrained")
     left, middle, right = style.beside(figure, 1.2, 0.6 + 0.62 * len(steps), 2.5)
     _draw_pair(left.subplots(2, 1), pair)
@@ -334,7 +334,7 @@ class FailureRow(NamedTuple):
 
 @style.styled
 def failures_figure(rows: Sequence[FailureRow]) -> Figure:
-    """A row a pair: reference above query, views evenly around, rendered above generated, the landscape."""
+    """One row per pair: reference above query, views all around (rendered above generated), the landscape."""
     figure = Figure(figsize=(WIDTH, 0.3 + 1.75 * len(rows)), layout="constrained")
     count = len(rows[0].generated)
     parts = style.stacked(figure, *[1] * len(rows))
@@ -376,7 +376,7 @@ def toy_figure(pair: ShownPair, densities: Mapping[str, Landscape]) -> Figure:
 
 @style.styled
 def comparison_figure(pairs: Sequence[ShownPair], titles: Sequence[str]) -> Figure:
-    """A row a pair: reference above query, and its maps, their own titles small; `titles` are those of the columns."""
+    """One row per pair: reference above query, and its maps with small titles; `titles` head the columns."""
     figure = Figure(figsize=(WIDTH, 0.4 + 1.45 * len(pairs)), layout="constrained")
     names = [[f"reference {row}", f"query {row}"] for row in range(len(pairs))]
     mosaic: list[Any] = [[name, *(f"map {row} {column}" for column in range(len(titles)))]
@@ -398,7 +398,7 @@ def _draw_pair(panels: Sequence[Axes], pair: ShownPair, titles: Sequence[str] = 
 
 
 def _small_map(axes: Axes, content: PoseMap, truth: NDArray | None, first: bool = True, last: bool = True) -> None:
-    """A small map, labelled where it is the first of its row and in the last one."""
+    """Draw a small map, with axis labels if it is the first in its row or in the last row."""
     draw_map(axes, content, truth)
     axes.set(xticks=[0, 90, 180, 270], yticks=[-30, 0, 30])
     axes.tick_params(pad=2, labelleft=first, labelbottom=last)

@@ -1,4 +1,4 @@
-"""Contact sheets of images: the objects of an evaluation, and the novel views of one."""
+"""Contact sheets of images: the objects of an evaluation, and novel views of one object."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from lp_framework.viz import style
 
 MOST_OBJECTS = 42
-LARGEST = 1.6  # inches, a side of a view
-MOST_LABELS = 18  # longitudes that are written out; of more, every second, third, ...
+LARGEST = 1.6  # inches per side of a view
+MOST_LABELS = 18  # longitudes with labels; of more, only every second, third, ...
 
 
 class ObjectCard(NamedTuple):
-    """An object on the contact sheet: a view `[H, W, 3]` of it, and its recall and success rate, if any, in [0, 1]."""
+    """An object on the contact sheet: one view `[H, W, 3]`, and its recall and success rate in [0, 1], if any."""
 
     name: str
     ambiguity: str
@@ -50,8 +50,8 @@ def views_figure(
     source: NDArray, views: NDArray, latitudes_degrees: Sequence[float], longitudes_degrees: Sequence[float],
     title: str, note: str,
 ) -> Figure:  # fmt: skip
-    """The source `[H, W, 3]` beside views `[rows, columns, h, w, 3]` (uint8), a row a latitude, a column a longitude,
-    relative to the source; a view at (0, 0), its own pose, is framed.
+    """The source `[H, W, 3]` beside views `[rows, columns, h, w, 3]` (uint8). Rows are latitudes and columns are
+    longitudes, relative to the source; a view at (0, 0), the source's own pose, is framed.
     """
     rows, columns = views.shape[:2]
     side = min(7.3 / columns, LARGEST)
@@ -75,5 +75,5 @@ def views_figure(
 
 
 def signed(angle: float) -> str:
-    """Degrees with their sign, in typographic minus."""
+    """Degrees with their sign, using a typographic minus."""
     return "0°" if angle == 0 else f"{angle:+g}°".replace("-", "\u2212")

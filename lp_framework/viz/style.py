@@ -1,4 +1,4 @@
-"""One look for all figures: type, lines, colours, axes in degrees, and saving."""
+"""The common style of all figures: type, lines, colours, axes in degrees, and saving."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from PIL.Image import Image
 
 from lp_framework.atomic import written
 
-# Okabe and Ito's palette, which the common kinds of colour blindness keep apart.
+# Okabe and Ito's palette, safe for the common kinds of colour blindness.
 BLUE, ORANGE, PURPLE, GREEN, VERMILION = "#0072B2", "#E69F00", "#CC79A7", "#009E73", "#D55E00"
 INK, MUTED, FAINT = "#222222", "#6B6B6B", "#D4D4D4"
 ASIDE: Any = {"color": MUTED, "fontsize": 7.5}
@@ -30,17 +30,17 @@ DENSITY = LinearSegmentedColormap.from_list("density", ["#FFFFFF", "#E9E4DA", "#
 
 SETTINGS = matplotlib.rc_params_from_file(Path(__file__).with_name("look.mplstyle"), use_default_template=False)
 
-# Of a plotting function: its figure has the common look, whatever the caller's settings are.
+# Decorates a plotting function: its figure has the common style, whatever the caller's settings.
 styled = matplotlib.rc_context(SETTINGS)
 
 
 def save_figure(figure: Figure, path: Path) -> list[Path]:
-    """Write `path`.png (200 dots an inch) and `path`.pdf (vectors), each whole or not at all; returns both."""
+    """Write `path`.png (200 dpi) and `path`.pdf (vectors), each atomically; returns both paths."""
     path.parent.mkdir(parents=True, exist_ok=True)
     files = []
     for suffix in ("png", "pdf"):
         file = path.with_name(f"{path.name}.{suffix}")
-        # Without a date the same figure is the same file.
+        # Without a date, the same figure gives the same file.
         metadata = {"CreationDate": None} if suffix == "pdf" else None
         with written(file) as partial, matplotlib.rc_context(SETTINGS):
             figure.savefig(partial, format=suffix, dpi=200, metadata=metadata)
@@ -49,7 +49,7 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
 
 
 def page(width: float, height: float, title: str, note: str = "") -> tuple[Figure, SubFigure]:
-    """A figure (inches) with a title and a note below it, and what is left of it for panels."""
+    """A figure (size in inches) with a title and a note below it, and the rest of it for panels."""
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
     (body,) = stacked(figure, 1)
@@ -59,23 +59,23 @@ def page(width: float, height: float, title: str, note: str = "") -> tuple[Figur
 
 
 def beside(part: Figure | SubFigure, *widths: float) -> list[SubFigure]:
-    """Parts of a figure side by side, of these relative widths."""
+    """Split a figure side by side, with relative `widths`."""
     return list(part.subfigures(1, len(widths), squeeze=False, width_ratios=widths)[0])
 
 
 def stacked(part: Figure | SubFigure, *heights: float) -> list[SubFigure]:
-    """Parts of a figure above each other, of these relative heights."""
+    """Split a figure from top to bottom, with relative `heights`."""
     return list(part.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
 
 
 def panels(part: SubFigure, count: int, columns: int) -> list[Axes]:
-    """So many axes, in rows of at most `columns`."""
+    """Add `count` axes, in rows of at most `columns`."""
     grid = part.add_gridspec(-(-count // columns), min(count, columns))
     return [part.add_subplot(grid[divmod(number, columns)]) for number in range(count)]
 
 
 def show_image(axes: Axes, image: NDArray | Image, title: str = "", **frame: Any) -> None:
-    """An image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame, a title above it."""
+    """Show an image `[H, W, 3]` (uint8, or floats in [0, 1]) in a thin frame, with a title above it."""
     axes.imshow(image, interpolation="antialiased")
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set(**{"color": FAINT, "linewidth": 0.8, **frame})
@@ -83,27 +83,27 @@ def show_image(axes: Axes, image: NDArray | Image, title: str = "", **frame: Any
 
 
 def class_keys(classes: Sequence[str]) -> list[Line2D]:
-    """The key's entries for those ambiguity classes that are among `classes`."""
+    """Legend entries for the ambiguity classes in `classes`."""
     return [Line2D([], [], color=colour, label=name) for name, colour in CLASS_COLOURS.items() if name in classes]
 
 
 def degrees(axis: Axis, step: float) -> None:
-    """Ticks every `step` degrees on an axis, labelled with a degree sign."""
+    """Put ticks every `step` degrees on an axis, labelled with a degree sign."""
     axis.set_major_locator(MultipleLocator(step))
     axis.set_major_formatter(StrMethodFormatter("{x:g}°"))
 
 
 def open_frame(axes: Axes) -> None:
-    """Only the left and bottom edge, and a faint grid."""
+    """Keep only the left and bottom edge, and add a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color=FAINT, linewidth=0.4)
 
 
 def letter(number: int, title: str) -> str:
-    """The title of a panel by its number: (a), (b), ..."""
+    """The title of a panel with its letter: (a), (b), ..."""
     return f"({chr(ord('a') + number)}) {title}"
 
 
 def shortened(name: str, room: float) -> str:
-    """A name that fits into so many letters."""
+    """Truncate a name to at most `room` characters."""
     return name if len(name) <= int(room) else name[: int(room) - 1] + "…"
