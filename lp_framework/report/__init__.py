@@ -1,1 +1,1 @@
-"""What is reported of finished runs: result tables beside the paper's numbers, and self-contained HTML pages."""
+"""Reports of finished runs: result tables beside the paper's numbers, and self-contained HTML pages."""

@@ -1,4 +1,4 @@
-"""What is written of an estimate: `poses.csv`, `results.json`, the cameras with their images, a picture and a page."""
+"""The output files of an estimate: `poses.csv`, `results.json`, the cameras with their images, a picture and a page."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ COLUMNS = (
     "relative_longitude_degrees", "relative_radius", "energy", "valid", "answer", "probability", "verdict",
     "second_latitude_degrees", "second_longitude_degrees", "second_probability",
 )  # fmt: skip
-MASKS = "masks"  # folder of the masks that a run has made
+MASKS = "masks"  # folder of the masks made by a run
 
 
 class Written(NamedTuple):
-    """The rows of `poses.csv` up to `valid`, whether masks were made, the photographs whose focal length is assumed,
-    and the page."""
+    """The rows of `poses.csv` up to the column `valid`, whether masks were made, the photographs with an assumed focal
+    length, and the page."""
 
     rows: list[list[Any]]
     masks_made: bool
@@ -42,7 +42,7 @@ class Written(NamedTuple):
 
 
 def write_estimate(folder: Path, found: Estimate, record: Mapping[str, Any]) -> Written:
-    """Write all files of an estimate into `folder`; `record` goes into `results.json` beside its numbers."""
+    """Write all files of an estimate into `folder`; `record` is added to the numbers in `results.json`."""
     degrees, framed = found.field_of_view_degrees, list(zip(found.photographs, found.prepared, strict=True))
     focals = [original_focal_length(*each, degrees) for each in framed]
     made = any(each.made for each in found.photographs)
@@ -91,7 +91,7 @@ def _second(second: Answer) -> list[float]:
 
 
 def _write_poses(folder: Path, found: Estimate) -> list[list[Any]]:
-    """The images, `poses.csv` and `cameras.png`; returns the rows of `poses.csv` up to `valid`."""
+    """Write the images, `poses.csv` and `cameras.png`; returns the rows of `poses.csv` up to `valid`."""
     files, pictures = found.files, [each.image for each in found.prepared]
     images = [f"images/{index:03d}.png" for index in range(len(files))]
     (folder / "images").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""The model card of a training run: what a trained model is, what it has met, how well it does and how it was made."""
+"""The model card of a training run: what the model is, its training data, its results and how it was made."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from lp_framework.report.page import BROKEN, read_record, render
 from lp_framework.report.runs import saved_config
 
 CARD = "README.md"
-OVERRIDES = Path(".hydra") / "overrides.yaml"  # what Hydra keeps of a command line
-NAMED = 40  # objects that a card names
+OVERRIDES = Path(".hydra") / "overrides.yaml"  # the command line's overrides, saved by Hydra
+NAMED = 40  # objects listed in a card
 
 
 def model_card(run: Path, name: str, license: str | None, results: str | None) -> str:
-    """A card in Markdown, with the metadata that the Hugging Face hub reads at its top.
+    """Build a card in Markdown, starting with the metadata for the Hugging Face hub.
 
-    `name` is what the model is loaded by; `results` is the folder of an evaluation of it. `UserError` where a file of
-    either is missing or damaged.
+    `name` is what the model is loaded by; `results` is the folder of its evaluation. `UserError` if a file of either
+    run is missing or damaged.
     """
     try:
         training, config = read_record(run / "training.json"), saved_config(run / "config.yaml")
@@ -48,7 +48,7 @@ def model_card(run: Path, name: str, license: str | None, results: str | None) -
 
 
 def _rows(evaluation: dict[str, Any]) -> list[tuple[str, list[str]]]:
-    """The rows of the metrics of an evaluation."""
+    """The rows of an evaluation's metrics."""
     keys = [*COLUMNS, *ERRORS]
     return [
         (name.strip(), [f"{row[key]:.3f}" if key in row else "" for key in keys])

@@ -1,6 +1,6 @@
-"""The page of a run, and that of a set of runs: one self-contained HTML file, from templates and the runs' files.
+"""The page of one run or of several: a self-contained HTML file, built from templates and the files of the runs.
 
-What is missing or damaged of a run is told in its place.
+A note replaces any part of a run that is missing or damaged.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from lp_framework.viz.curves import read_losses
 from lp_framework.viz.style import CLASS_COLOURS
 
 PAGE = "report.html"
-LARGEST = 5_000_000  # letters of runs' parts on the page of a set; the rest of the runs are in the table alone
-WORST = 20  # pairs in the table of the worst
+LARGEST = 5_000_000  # characters of details on the page of several runs; further runs appear only in the table
+WORST = 20  # pairs in the table of the worst pairs
 TRAINING, LANDSCAPE, OVERVIEW = "training.json", "landscape.json", "azimuth.json"
-RESULTS = (RESULT, TRAINING, LANDSCAPE, OVERVIEW)  # the files of which a finished run has one
+RESULTS = (RESULT, TRAINING, LANDSCAPE, OVERVIEW)  # a finished run has one of these files
 POSE = ("latitude_degrees", "longitude_degrees", "radius")
-# What a missing or damaged file leads to; `UserError` is a `ValueError`.
+# Raised for missing or damaged files; `UserError` is a `ValueError`.
 BROKEN = (
     OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError, UndefinedError, csv.Error,
 )  # fmt: skip
@@ -51,7 +51,7 @@ About = tuple[str, str, Mapping[str, str]]  # title, subtitle, and the most impo
 
 
 class RunPart(NamedTuple):
-    """A run on a page: what it is in a few words, its most important numbers by name, its sections (HTML) by title."""
+    """A run on a page: title and subtitle, its most important numbers by name, its sections (HTML) by title."""
 
     title: str
     subtitle: str
@@ -60,8 +60,8 @@ class RunPart(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """What the page shows of a kind of run: a heading for several of them, what the run is, and its sections by title,
-    each a template and what fills it from the run's folder.
+    """What the page shows for a kind of run: a heading for several runs, a description of the run, and sections by
+    title, each a template and a function that fills it from the run's folder.
     """
 
     heading: str
@@ -70,7 +70,7 @@ class Contents(NamedTuple):
 
 
 def run_part(folder: Path, contents: Contents) -> RunPart:
-    """The run in `folder`, with its configuration as the last section."""
+    """Read the run in `folder`; its last section is the configuration."""
     try:
         about = contents.about(folder)
     except BROKEN as error:
@@ -95,17 +95,17 @@ def reason(error: Exception) -> str:
 
 
 def render(template: str, **values: Any) -> str:
-    """A template of this package with these values, in which text is escaped."""
+    """Render a template of this package with these values; text is escaped."""
     return _ENVIRONMENT.get_template(template).render(values)
 
 
 def read_record(file: Path) -> dict[str, Any]:
-    """The object in a JSON file."""
+    """Read the object in a JSON file."""
     return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
 def read_rows(file: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file with a heading."""
+    """Read the rows of a CSV file with a header."""
     with file.open(newline="", encoding="utf-8") as content:
         return list(csv.DictReader(content))
 
@@ -119,13 +119,13 @@ def _configuration(folder: Path) -> dict[str, Any]:
 
 
 def packed(content: go.Figure | str) -> str:
-    """A figure or a text for the page's script, compressed, in letters."""
+    """Compress a figure or text and encode it as ASCII for the page's script."""
     text = content if isinstance(content, str) else content.to_json()
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
 
 def picture(image: NDArray, side: int) -> str:
-    """An image `[H, W, 3 or 4]` (uint8) as an address that holds it (WebP), shrunk to at most `side` pixels."""
+    """Encode an image `[H, W, 3 or 4]` (uint8) as a data URL (WebP), shrunk to at most `side` pixels."""
     shrunk = Image.fromarray(image)
     shrunk.thumbnail((side, side), Image.Resampling.LANCZOS)
     content = io.BytesIO()
@@ -134,12 +134,12 @@ def picture(image: NDArray, side: int) -> str:
 
 
 def sheet(file: Path) -> str:
-    """A printed figure (PNG file) as an address that holds it."""
+    """Encode a saved figure (PNG file) as a data URL."""
     return f"data:image/png;base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
 def number(name: str, value: float) -> str:
-    """A metric's value, rounded as is usual for it."""
+    """Format a metric's value with its usual rounding."""
     if not math.isfinite(value):
         return "inf"
     if name == "rotation_error":
@@ -149,18 +149,18 @@ def number(name: str, value: float) -> str:
 
 
 def metric(metrics: Mapping[str, float | None], key: str) -> str:
-    """A metric in print; a solver with one answer has no success rates, and null is infinity."""
+    """Format a metric; solvers with a single answer have no success rates, and null is infinity."""
     value = metrics.get(key, math.nan)
     return number(key, math.inf if value is None else value) if key in metrics else "-"
 
 
 def write_run_page(folder: Path, kind: Kind) -> Path:
-    """Write `report.html` into the folder of a finished run, from what is there."""
+    """Write `report.html` into the folder of a finished run, from the files in it."""
     return write_report_page(folder / PAGE, [(folder, kind)], {})
 
 
 def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Mapping[str, str]) -> Path:
-    """Write the page of several runs, or of one: the sections `above`, the runs in tables, and each to be opened."""
+    """Write the page of one or more runs: the sections `above`, tables of the runs, and each run's details."""
     if len(runs) == 1:
         part = run_part(runs[0][0], contents_of(*runs[0]))
         *sections, configuration = part.sections.items()
@@ -181,7 +181,7 @@ def write_report_page(path: Path, runs: Sequence[tuple[Path, Kind]], above: Mapp
 
 
 def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> dict[str, str]:
-    """A table for the runs of each command, and all that each of them shows, while there is room."""
+    """A table of the runs of each command, and the details of those runs that fit."""
     listed: list[dict[str, Any]] = []
     room = LARGEST
     for number, (folder, kind) in enumerate(runs):
@@ -218,7 +218,7 @@ def _about_evaluation(folder: Path) -> About:
 
 
 def _pairs(folder: Path) -> dict[str, Any]:
-    """The pairs that a run keeps beside its pictures, each with its plots (packed, by kind) and the steps they show."""
+    """The pairs that a run saved with its pictures, each with its plots (packed, by kind) and the steps they show."""
     if not (folder / "pictures").is_dir():
         raise UserError("the run has no pictures, as with pictures=false")
     shown = []
@@ -300,7 +300,7 @@ def _poses(folder: Path) -> dict[str, Any]:
 
 
 def _images(folder: Path, rows: Sequence[Mapping[str, str]]) -> list[NDArray]:
-    """The prepared images of rows; only what lies in the run's own folder is read."""
+    """The prepared images of rows; only files inside the run's own folder are read."""
     return [_image(folder / "images" / Path(row["image"]).name) for row in rows]
 
 
@@ -350,7 +350,7 @@ CONTENTS: Mapping[str, Contents] = {
 
 
 def contents_of(folder: Path, kind: Kind) -> Contents:
-    """What the page shows of a run; a `landscape` is that of a pair, or the overview of all objects."""
+    """What the page shows for a run; a `landscape` run is that of a pair or the overview of all objects."""
     return CONTENTS["overview" if kind == "landscape" and not (folder / LANDSCAPE).is_file() else kind]
 
 

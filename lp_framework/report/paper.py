@@ -1,9 +1,9 @@
-"""The paper's own numbers, as data: `paper/*.yaml`, a file a table.
+"""The paper's own numbers as data: `paper/*.yaml`, one file per table.
 
-A file holds the table's `title`, the `experiments` of this project that repeat it, its `source` and `caption`, `notes`
-on what differs, the dotted `settings` in which its rows differ, the `columns` of its values (named as in
-`results.json`), and `rows`: a `label`, the `settings` that the run to compare with has, the `data` set in tables of
-several, and the `values`, null where the paper has none.
+A file holds the table's `title`, `source` and `caption`, the `experiments` of this project that reproduce it, `notes`
+on differences, the dotted `settings` in which its rows differ, the `columns` (named as in `results.json`), and `rows`.
+Each row has a `label`, the `settings` of the runs to compare it with, the `data` set in tables with several, and
+`values`, null if the paper gives none.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import yaml
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of a table; `data` is its data set by its name here, None in a table of one."""
+    """A row of a table; `data` is the name of its data set here, None in a table of one."""
 
     label: str
     settings: Mapping[str, Any]
@@ -29,7 +29,7 @@ class PaperRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper; see the files."""
+    """A table of the paper; see the module."""
 
     name: str
     title: str
@@ -42,19 +42,19 @@ class PaperTable:
     rows: Sequence[PaperRow]
 
     def matching(self, settings: Mapping[str, Any]) -> list[PaperRow]:
-        """The rows whose settings a run has; of a data set of the table that one's rows alone."""
+        """The rows that match a run's settings; only those of its data set if the table has any."""
         rows = [row for row in self.rows if row.settings.items() <= settings.items()]
         return [row for row in rows if row.data is not None and row.data == settings.get("data.name")] or rows
 
 
 def paper_table(experiment: str | None) -> PaperTable | None:
-    """The table that an experiment repeats, if the paper has one."""
+    """The paper's table that an experiment reproduces, if any."""
     return next((table for table in paper_tables() if experiment in table.experiments), None)
 
 
 @cache
 def paper_tables() -> tuple[PaperTable, ...]:
-    """All tables that are here, by name."""
+    """All tables, sorted by name."""
     tables = []
     for file in sorted((Path(__file__).parent / "paper").glob("*.yaml")):
         content = yaml.safe_load(file.read_text(encoding="utf-8"))

@@ -1,9 +1,9 @@
-"""The interactive plots of a page, as figures of plotly.
+"""The interactive plots of a page, as Plotly figures.
 
-Colours are CSS variables of the page, which its script fills in for the light or the dark scheme. In the plots of a
-pair the ways of all starts stand still, and frames move the marks on them: the layout's `meta` has the numbers of the
-`traces` that move, and in `frames` their points at each step that is shown. (Plotly's own frames are traces, which take
-long to make.) A trace whose `meta` names a landscape is shown while that one is chosen.
+Colours are CSS variables of the page; its script fills them in for the light or dark theme. In the plots of a pair, the
+trajectories are static and frames move the marks along them: the layout's `meta` lists the indices of the moving
+`traces`, and `frames` holds their points at each step shown. (Plotly's own frames are traces, which are slow to build.)
+A trace whose `meta` names a landscape is visible while that landscape is selected.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ INK, MUTED, LINE, SURFACE, HALO, TRUTH, ANSWER, OTHERS, REFERENCE, GREY = (
     f"var(--{name})"
     for name in ("ink", "muted", "line", "surface", "halo", "truth", "answer", "others", "reference", "unlabelled")
 )  # fmt: skip
-WHITE, DARK = "#ffffff", "#3A3A3A"  # over a landscape, which is the same in both schemes
+WHITE, DARK = "#ffffff", "#3A3A3A"  # over a landscape, which is the same in both themes
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK}
 AXIS = {"gridcolor": LINE, "linecolor": LINE, "zerolinecolor": LINE, "title": {"font": {"color": MUTED}}}
 LOOK = {
     "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "hovermode": "closest",
     "margin": {"l": 54, "r": 16, "t": 10, "b": 44}, "xaxis": AXIS, "yaxis": AXIS,
     "scene": {"xaxis": AXIS, "yaxis": AXIS, "zaxis": AXIS, "aspectmode": "manual", "dragmode": "turntable"},
-    "legend": {"orientation": "h", "x": 0, "y": 1.01, "yanchor": "bottom"},  # above the curves, which it would hide
+    "legend": {"orientation": "h", "x": 0, "y": 1.01, "yanchor": "bottom"},  # above the curves, so as not to hide them
     "hoverlabel": {"bgcolor": SURFACE, "bordercolor": LINE, "font": {"color": INK}},
-    "uirevision": "kept",  # zoom and viewpoint stay when colours change
+    "uirevision": "kept",  # keep zoom and viewpoint when colours change
 }  # fmt: skip
 PLACE = "longitude %{x:.1f}°, latitude %{y:.1f}°"
-FRAMES = 40  # of a pair, at most
-PIXELS = 32  # a side of an image in space
-GLOBE = 0.42  # object sizes, the radius
+FRAMES = 40  # per pair, at most
+PIXELS = 32  # per side of an image in 3-D
+GLOBE = 0.42  # radius in object sizes
 OUTLINE = [0, 1, 2, 3, 0, 4, 1, 2, 4, 3]  # all edges of a frustum in one line
 
-Points = Callable[[NDArray], NDArray]  # from poses [S, 3] to points [T, 2] of the map, or [T, 3] in space
-# Of a trace that the frames move: its number, ways [_, S, 3], and where they are drawn.
+Points = Callable[[NDArray], NDArray]  # from poses [S, 3] to points [T, 2] of the map, or [T, 3] in 3-D
+# A trace moved by the frames: its index, trajectories [_, S, 3], and the function that places them.
 Moving = tuple[int, NDArray, Points]
 
 
 def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
-    """The share of pairs within a rotation error, for each class of objects its errors `[P]` (degrees, NaN: none)."""
+    """Plot the share of pairs within a rotation error, from the errors `[P]` of each class (degrees, NaN if none)."""
     ticks = [0, *ROTATION_THRESHOLDS, 60, 90, 120, 180]
     across = {"tickvals": [math.sqrt(each) for each in ticks], "ticktext": [f"{each}°" for each in ticks]}
     figure = _figure(
@@ -76,7 +76,7 @@ def errors_plot(errors: Mapping[str, NDArray]) -> go.Figure:
 
 
 def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
-    """Losses by their logged names over the steps, many of them pale behind their running mean; the learning rate."""
+    """Plot losses by their logged names (long ones pale behind a running mean) and the learning rate over steps."""
     loss = {"type": "log", "domain": [0 if rate is None else 0.32, 1], "dtick": "D2", "tickformat": "~g"}
     below = {"domain": [0, 0.22], "rangemode": "tozero", "nticks": 3, "exponentformat": "e"}
     figure = _figure(
@@ -100,7 +100,7 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
 
 
 def cameras_plot(poses: NDArray, images: Sequence[NDArray], field_of_view: float) -> go.Figure:
-    """Cameras of one field of view (radians) at view poses `[V, 3]` with their images `[S, S, 4]`; that of the first
+    """Plot cameras of one field of view (radians) at view poses `[V, 3]` with their images `[S, S, 4]`. The first image
     also stands for the object."""
     furthest = float(poses[:, 2].max())
     figure = _space(1.1 * furthest, poses[0, 1])
@@ -115,19 +115,19 @@ def cameras_plot(poses: NDArray, images: Sequence[NDArray], field_of_view: float
 
 
 def pair_plots(pair: ShownPair) -> dict[str, go.Figure]:
-    """The plots of a pair by their kind: from above, as relief where it has landscapes, and the cameras."""
+    """The plots of a pair by kind: the map, the surface if it has landscapes, and the cameras."""
     relief = {"surface": surface_plot(pair)} if pair.landscapes else {}
     return {"map": map_plot(pair), **relief, "cameras": _pair_cameras_plot(pair)}
 
 
 def frame_steps(pair: ShownPair) -> list[int]:
-    """The steps of the solver that the frames of a pair show, the last one among them."""
+    """The solver steps shown in the frames of a pair, including the last one."""
     steps: list[int] = np.unique(np.linspace(0, _parts(pair)[1].shape[1] - 1, FRAMES).round().astype(int)).tolist()
     return steps
 
 
 def map_plot(pair: ShownPair) -> go.Figure:
-    """A pair's landscapes from above (degrees), and the ways of all starts over them."""
+    """Plot a pair's landscapes as maps (degrees), with the trajectories of all starts."""
     ends = [pose[0] for pose in (pair.truth, _parts(pair)[1][0, -1]) if pose is not None]
     limit = max(60.0, *(abs(math.degrees(each)) + 5 for each in np.nan_to_num(ends)))
     angle = {"ticksuffix": "°", "zeroline": False}
@@ -156,7 +156,7 @@ def map_plot(pair: ShownPair) -> go.Figure:
 
 
 def surface_plot(pair: ShownPair) -> go.Figure:
-    """A pair's landscapes as relief, with the ways of all starts on it; the truth is a pole."""
+    """Plot a pair's landscapes as surfaces, with the trajectories of all starts; a pole marks the truth."""
     angle = {"ticksuffix": "°", "showspikes": False}
     axes = {
         "xaxis": {"title": {"text": "longitude"}, "range": [0, 360], "dtick": 90, **angle},
@@ -181,7 +181,7 @@ def surface_plot(pair: ShownPair) -> go.Figure:
 
 
 def add_way(figure: go.Figure, path: NDArray, name: str, colour: str, landscape: Landscape | None = None) -> None:
-    """Draw a further way `[S, 3]`, with a mark at its end, into a map, or into the surface of a landscape."""
+    """Add a trajectory `[S, 3]`, with a mark at its end, to a map or to the surface of a landscape."""
     along, on_map = (
         (_along_map, _on_map) if landscape is None else (_raised(landscape, f) for f in (_along_map, _on_map))
     )
@@ -190,7 +190,7 @@ def add_way(figure: go.Figure, path: NDArray, name: str, colour: str, landscape:
 
 
 def add_targets(figure: go.Figure, landscape: Landscape) -> None:
-    """Lay an invisible grid of 2 degrees over a map, whose points report clicks."""
+    """Add an invisible 2-degree grid to a map; its points report clicks."""
     latitude, longitude, energy = closed(landscape)
     fine = np.arange(latitude[0], latitude[-1] + 1e-6, 2.0), np.arange(0.0, 360.0, 2.0)
     values = RegularGridInterpolator((latitude, longitude), energy)(
@@ -203,13 +203,13 @@ def add_targets(figure: go.Figure, landscape: Landscape) -> None:
 
 
 def _pair_cameras_plot(pair: ShownPair) -> go.Figure:
-    """The cameras of a pair around a globe that bears the landscapes: both with their images, and where the ways go."""
+    """Plot the cameras of a pair with their images around a globe showing the landscapes, and the trajectories."""
     reference = pair.reference.pose
     distance = 0.32 * reference[2]
     query = None if pair.truth is None else reference + pair.truth
     figure = _space(1.1 * max(reference[2], 0.0 if query is None else query[2]), reference[1])
     look: dict[str, Any] = {"lighting": {"ambient": 0.9, "diffuse": 0.3, "specular": 0}, "hoverinfo": "skip"}
-    if pair.landscapes:  # the plain core fills the poles
+    if pair.landscapes:  # the plain core covers the poles
         core = np.linspace(-math.pi / 2, math.pi / 2, 13), np.linspace(0, 2 * math.pi, 31)
         figure.add_mesh3d(**_ball(*core, GLOBE - 0.02), color=LINE, **look)
     for name, landscape in pair.landscapes.items():
@@ -236,11 +236,11 @@ def _pair_cameras_plot(pair: ShownPair) -> go.Figure:
 
 
 def _parts(pair: ShownPair) -> tuple[NDArray, NDArray]:
-    """The ways `[_, S, 3]` of the other starts, and of the answer; of solvers that keep none, where they ended."""
+    """Trajectories `[_, S, 3]` of the other starts, and of the answer; just the ends if the solver keeps none."""
     paths = pair.ends[:, None] if pair.trajectories is None else pair.trajectories
-    if not len(paths):  # no start came to a pose
+    if not len(paths):  # no start reached a pose
         paths = np.full((1, 1, 3), np.nan)
-    chosen = pair.chosen or 0  # a pair that was saved has one
+    chosen = pair.chosen or 0  # saved pairs have one
     return np.delete(paths, chosen, axis=0), paths[[chosen]]
 
 
@@ -282,18 +282,18 @@ def _framed(figure: go.Figure, pair: ShownPair, moving: Sequence[Moving]) -> go.
 
 
 def _on_map(poses: NDArray) -> NDArray:
-    """Relative poses `[S, 3]` on the map: longitude and latitude `[S, 2]`, degrees."""
+    """Map relative poses `[S, 3]` to longitude and latitude `[S, 2]`, degrees."""
     return np.stack([np.degrees(poses[:, 1]) % 360, np.degrees(poses[:, 0])], axis=-1)
 
 
 def _along_map(path: NDArray) -> NDArray:
-    """A path `[S, 3]` on the map, with a gap (NaN) where it crosses the seam."""
+    """A path `[S, 3]` on the map, with a gap (NaN) at each crossing of the seam."""
     latitude, longitude = broken_at_seam(np.degrees(path[:, 0]), np.degrees(path[:, 1]))
     return np.stack([longitude, latitude], axis=-1)
 
 
 def _raised(landscape: Landscape, place: Points) -> Points:
-    """`place`, with the height of the landscape there, a little above it."""
+    """Extend `place` by the landscape's height, slightly raised."""
     latitude, longitude, energy = closed(landscape)
     height = RegularGridInterpolator((latitude, longitude), energy, bounds_error=False)
     lift = 0.03 * (np.nanmax(energy) - np.nanmin(energy) or 1.0)
@@ -307,7 +307,7 @@ def _raised(landscape: Landscape, place: Points) -> Points:
 
 
 def _space(radius: float, longitude: float) -> go.Figure:
-    """The ground with its longitudes, for cameras at most `radius` away, seen from above a longitude."""
+    """The ground with its longitudes, for cameras up to `radius` away, seen from above a longitude."""
     x, y, _ = 1.9 * _standing(np.array([math.sin(longitude + 0.6), 0.0, math.cos(longitude + 0.6)]))
     sides = {"xaxis": 1.3, "yaxis": 1.3, "zaxis": 1.1}
     axes = {name: {"visible": False, "range": [-most * radius, most * radius]} for name, most in sides.items()}
@@ -320,7 +320,7 @@ def _space(radius: float, longitude: float) -> go.Figure:
 
 
 def _standing(points: NDArray) -> NDArray:
-    """Points `[..., 3]` in plotly's space, where +Z is up and not +Y."""
+    """Convert points `[..., 3]` to Plotly's axes, where +Z is up instead of +Y."""
     return points[..., [0, 2, 1]] * [1, -1, 1]
 
 
@@ -329,7 +329,7 @@ def _centres(poses: NDArray) -> NDArray:
 
 
 def _frustum(pose: NDArray, distance: float, field_of_view: float) -> NDArray:
-    """The corners of what a camera sees at a distance, as `image_plane` has them, and its centre: `[5, 3]`."""
+    """Corners of a camera's view at a distance, ordered as in `image_plane`, and its centre: `[5, 3]`."""
     camera = camera_to_world(torch.from_numpy(pose)).numpy()
     plane = image_plane(camera, distance, field_of_view / 2)
     return _standing(np.vstack([plane, camera[:3, 3]]))
@@ -340,7 +340,7 @@ def _add_camera(figure: go.Figure, frustum: NDArray, image: NDArray, colour: str
 
 
 def _image(frustum: NDArray, image: NDArray, side: int = PIXELS) -> go.Mesh3d:
-    """An image `[S, S, 3 or 4]` without its white ground, on the image plane of a camera."""
+    """An image `[S, S, 3 or 4]` without its white background, on the image plane of a camera."""
     pixels = np.asarray(Image.fromarray(image).convert("RGBA").resize((side, side))).reshape(-1, 4)
     shown = (pixels[:, 3] >= 128) & (pixels[:, :3].min(axis=1) <= 246)
     lower_left, lower_right, _, upper_left, _ = frustum
@@ -352,14 +352,14 @@ def _image(frustum: NDArray, image: NDArray, side: int = PIXELS) -> go.Mesh3d:
 
 
 def _ball(latitude: NDArray, longitude: NDArray, radius: float) -> dict[str, Any]:
-    """The mesh of a part of a sphere, of latitudes `[A]` and longitudes `[O]`; a surface would take longer to draw."""
+    """The mesh of a part of a sphere, over latitudes `[A]` and longitudes `[O]`; draws faster than a surface."""
     up, east = np.meshgrid(latitude.clip(-math.pi / 2, math.pi / 2), longitude, indexing="ij")
     points = _centres(np.stack([up, east, np.full_like(up, radius)], axis=-1).reshape(-1, 3))
     return _mesh(points.reshape(*up.shape, 3), np.ones((len(latitude) - 1) * (len(longitude) - 1), dtype=bool))
 
 
 def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
-    """Two triangles for each of the cells `[R * C]` that are `shown`, of a grid of points `[R + 1, C + 1, 3]`."""
+    """Two triangles for each `shown` cell `[R * C]` of a grid of points `[R + 1, C + 1, 3]`."""
     rows, columns = points.shape[0] - 1, points.shape[1] - 1
     corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()[shown]
     below = corner + columns + 1
@@ -372,7 +372,7 @@ def _figure(**layout: Any) -> go.Figure:
 
 
 def _scene(aspect: Sequence[float], eye: Sequence[float], below: float, **axes: Any) -> go.Figure:
-    """A figure in space: the lengths of its axes, and a camera that looks `below` the middle."""
+    """A 3-D figure with axis lengths `aspect` and a camera that looks `below` the middle."""
     camera = {"eye": dict(zip("xyz", eye, strict=True)), "center": {"x": 0, "y": 0, "z": below}}
     scene = {**axes, "aspectratio": dict(zip("xyz", aspect, strict=True)), "camera": camera}
     return _figure(margin=dict.fromkeys("lrtb", 0), scene=scene)
@@ -393,7 +393,7 @@ def _add_marks(
 
 
 def _trace(points: NDArray, **more: Any) -> go.Scatter | go.Scatter3d:
-    """A trace of points `[T, 2]` on the map, or `[T, 3]` in space."""
+    """A trace of points `[T, 2]` on the map, or `[T, 3]` in 3-D."""
     return (go.Scatter if points.shape[1] == 2 else go.Scatter3d)(**_xyz(points), **more)
 
 
@@ -406,6 +406,6 @@ def _curve(curve: Curve) -> dict[str, list[float]]:
 
 
 def _numbers(values: NDArray) -> Any:
-    """Values as lists, to five digits of the largest."""
+    """Lists, rounded to five digits of the largest value."""
     largest = np.abs(np.nan_to_num(values, posinf=0, neginf=0)).max(initial=0)
     return np.round(values, 4 - math.floor(math.log10(largest or 1))).tolist()

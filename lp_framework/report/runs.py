@@ -1,4 +1,4 @@
-"""Finished runs on disk: which there are below some folders, and what was set in each evaluation."""
+"""Find finished runs on disk, and read the settings and metrics of evaluations."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from lp_framework.errors import UserError
 from lp_framework.evaluation.journal import dotted
 from lp_framework.evaluation.tables import RESULT
 
-HYDRA = Path(".hydra") / "hydra.yaml"  # what Hydra keeps of a job: its command and its choices
+HYDRA = Path(".hydra") / "hydra.yaml"  # Hydra's record of a job: its command and its choices
 COSTS = ("seconds_per_pair", "network_passes_per_pair")
-# Settings that are not compared: they change no result. The checkpoint has `checkpoint_setting`.
+# Settings that are not compared because they change no result. The checkpoint has `checkpoint_setting`.
 ASIDE = ("plugins", "checkpoint", "seed", "batch_pairs", "pictures", "resume")
 Kind = Literal["eval", "train", "estimate", "landscape"]  # the commands whose runs have a page
-# What tells a run whose Hydra folder is gone: the first of these files that it has.
+# Without a Hydra folder, the first of these files that exists identifies the command.
 FILES: dict[str, Kind] = {
     "training.json": "train", "metrics.csv": "train", "landscape.json": "landscape", "azimuth.json": "landscape",
     "poses.csv": "estimate", RESULT: "eval",
@@ -33,10 +33,10 @@ FILES: dict[str, Kind] = {
 
 @dataclass(frozen=True)
 class Run:
-    """A finished evaluation: its folder, the experiment's name if it had one, and what was set.
+    """A finished evaluation: its folder, its experiment's name, if any, and its settings.
 
-    `settings` are those of `settings` and `checkpoint_setting`. `metrics` are over `all` objects, and over those with a
-    `unique_answer` (None where no object is labelled so), with `COSTS`. A median error that is not finite is infinite.
+    `settings` come from `settings` and `checkpoint_setting`. `metrics` are over `all` objects, and over those with a
+    `unique_answer` (None if no object is labelled so), with `COSTS`. A median error that is not finite is infinite.
     """
 
     folder: Path
@@ -49,14 +49,14 @@ class Run:
 
 
 class LeftOut(NamedTuple):
-    """A run that is not counted, and why."""
+    """A run that is left out, and why."""
 
     folder: Path
     reason: str
 
 
 def run_folders(folders: Sequence[Path]) -> list[tuple[Path, Kind]]:
-    """All runs with a page in and below `folders`, each once, in natural order; `UserError` for a missing folder."""
+    """All runs with a page in and below `folders`, sorted, without duplicates; `UserError` if a folder is missing."""
     found: dict[Path, tuple[Path, Kind]] = {}
     for folder in folders:
         if not folder.is_dir():
@@ -68,7 +68,7 @@ def run_folders(folders: Sequence[Path]) -> list[tuple[Path, Kind]]:
 
 
 def run_kind(folder: Path) -> Kind | None:
-    """The command that made the folder, None where it is none with a page."""
+    """The command that made the folder; None if that command has no page."""
     command, _ = _job(folder)
     if command is None:
         return next((kind for file, kind in FILES.items() if (folder / file).is_file()), None)
@@ -76,8 +76,8 @@ def run_kind(folder: Path) -> Kind | None:
 
 
 def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
-    """All finished evaluations in and below `folders` (`UserError` for one that is not there), and those that are
-    unfinished, damaged or repeat another.
+    """Find all finished evaluations in and below `folders` (`UserError` if one is missing), and those left out because
+    they are unfinished, damaged or duplicates.
     """
     runs: dict[str, Run] = {}
     left_out: list[LeftOut] = []
@@ -94,7 +94,7 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
 
 
 def read_run(folder: Path) -> Run:
-    """The finished evaluation in `folder`; `UserError` where its `results.json` is missing, damaged or another's."""
+    """Read the evaluation in `folder`; `UserError` if its `results.json` is missing, damaged or of another kind."""
     file = folder / RESULT
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
@@ -117,7 +117,7 @@ def read_run(folder: Path) -> Run:
 
 
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What was set, by dotted keys: without seeds, plugin folders and the checkpoint; whole numbers as int.
+    """Flatten a config to dotted keys, without seeds, plugin folders and the checkpoint; whole numbers become int.
 
     >>> settings({"seed": 1, "data": {"name": "toy", "seed": 1}, "solver": {"gamma": 0.3}})
     {'data.name': 'toy', 'solver.gamma': 0.3}
@@ -127,10 +127,10 @@ def settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
-    """`{"checkpoint": ...}`, nothing for a solver without a model.
+    """`{"checkpoint": ...}`; empty for a solver without a model.
 
-    Models that differ in their training's seed alone have one value: the training run's settings and which of its files
-    it is, as JSON, where its folder is there, else the path.
+    Models that differ only in their training seed share one value: the settings of the training run and the file's name
+    as JSON, if the run's folder exists, else the path.
     """
     if checkpoint is None:
         return {}
@@ -144,7 +144,7 @@ def checkpoint_setting(checkpoint: str | None) -> dict[str, Any]:
 
 
 def saved_config(file: Path) -> dict[str, Any]:
-    """The `config.yaml` of a training run, resolved; `UserError` where it is missing or damaged."""
+    """Read the resolved `config.yaml` of a training run; `UserError` if it is missing or damaged."""
     try:
         content: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=True)
         return dict(content)
@@ -153,7 +153,7 @@ def saved_config(file: Path) -> dict[str, Any]:
 
 
 def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
-    """A name for every value of the setting `checkpoint`: the model's where that tells them apart, else the path."""
+    """A name for every value of the setting `checkpoint`: the model's name if it is unambiguous, else the path."""
     paths = {run.settings["checkpoint"]: run.checkpoint for run in runs if run.checkpoint is not None}
     named = {value: path for value, path in paths.items() if value != path}
     models = paths | {value: json.loads(value).get("model.name", path) for value, path in named.items()}
@@ -161,7 +161,7 @@ def checkpoint_names(runs: Sequence[Run]) -> dict[str, str]:
 
 
 def _job(folder: Path) -> tuple[str | None, str | None]:
-    """The command and the experiment of the job in `folder`, None where they are not known."""
+    """The command and the experiment of the job in `folder`; None if unknown."""
     try:
         hydra = yaml.load((folder / HYDRA).read_text(encoding="utf-8"), yaml.CSafeLoader)["hydra"]
         return hydra["job"]["name"], hydra["runtime"]["choices"].get("experiment")
@@ -174,7 +174,7 @@ def _metrics(values: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _number(value: Any) -> Any:
-    """A value with whole numbers as int, so that 0.0 is 0."""
+    """Convert whole numbers to int, so that 0.0 becomes 0."""
     if isinstance(value, list):
         return [_number(each) for each in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -1,4 +1,4 @@
-"""The figures of a sweep's table: shares over a number that was swept, or combinations of settings side by side."""
+"""The figures of a sweep's table: metrics over a swept number, or combinations of settings side by side."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lp_framework.evaluation.metrics import ROTATION_THRESHOLDS
 from lp_framework.report.sweep_tables import Row, Spread, Sweep, SweepTable, heading, layout, shown
 from lp_framework.viz.style import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, VERMILION, open_frame, save_figure, styled
 
-# Numbers with a figure of their own, and its horizontal axis; the first that varies wins.
+# Numeric settings with a figure of their own, and its x-axis label; the first that varies wins.
 AXES = {
     "views": "number of images",
     "start.count": "number of starts",
@@ -32,7 +32,7 @@ TIME = "seconds per pair (log scale)"
 SECONDS, SOLVER = "seconds_per_pair", "solver.name"
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-DASHES = (0, (3, 2))  # of the paper's curves
+DASHES = (0, (3, 2))  # for the paper's curves
 PAPER = "the paper: other data, other prior"
 PLACE = ("data.name", "protocol", "checkpoint", "prior.name", "solver.name", "start.name", "views")  # of all runs
 
@@ -48,7 +48,7 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Curves over one axis, which is logarithmic for `TIME`."""
+    """Curves over one x-axis, logarithmic for `TIME`."""
 
     title: str
     xlabel: str
@@ -56,7 +56,7 @@ class Panel(NamedTuple):
 
 
 def draw_sweep(table: SweepTable, folder: Path) -> Sweep:
-    """A table with the figures that it calls for, which are saved in `folder`."""
+    """Draw the figures that suit a table, and save them in `folder`."""
     name = table.experiment or "runs"
     shared = [f"{heading(key)} {shown(table.common[key])}" for key in PLACE if table.common.get(key) is not None]
     figures = {name: sweep_figure(table), f"{name}_seconds": cost_figure(table)}
@@ -65,7 +65,7 @@ def draw_sweep(table: SweepTable, folder: Path) -> Sweep:
 
 
 def sweep_figure(table: SweepTable) -> Figure | None:
-    """What the settings that vary call for: shares over a number, or the rows beside each other; None for one row."""
+    """The figure that suits the varying settings: metrics over a number, or rows side by side; None for one row."""
     axis = next((key for key in AXES if is_swept(table, key)), None)
     if axis is not None and len(table.apart_from(axis)) <= len(COLOURS):
         return curves_figure(_panels(table, axis))
@@ -78,8 +78,8 @@ def sweep_figure(table: SweepTable) -> Figure | None:
 
 
 def cost_figure(table: SweepTable) -> Figure | None:
-    """Rotation recall of each solver against its seconds per pair; None for one solver, for more rows than colours, or
-    where the table's own figure has the time.
+    """Rotation recall of each solver over its seconds per pair; None for one solver, for more rows than colours, or if
+    the table's own figure already shows the time.
     """
     solvers = [row.settings.get(SOLVER) for row in table.rows]
     if len(set(solvers)) < 2 or len(table.rows) > len(COLOURS) or is_swept(table, "start.count"):
@@ -95,7 +95,7 @@ def cost_figure(table: SweepTable) -> Figure | None:
 
 @styled
 def curves_figure(panels: Sequence[Panel]) -> Figure:
-    """Panels side by side on one axis of shares; the paper's curves are dashed, with hollow marks."""
+    """Panels side by side with a shared y-axis; the paper's curves are dashed, with hollow marks."""
     figure, row = _side_by_side(len(panels), 3.3)
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     for axes, panel in zip(row, panels, strict=True):
@@ -124,7 +124,7 @@ def curves_figure(panels: Sequence[Panel]) -> Figure:
 
 @styled
 def rows_figure(rows: Mapping[str, Row]) -> Figure:
-    """A line a row, from the top, by its label, in panels of metrics: a mark a metric at its share."""
+    """One line per row, from the top, with its label, in panels of metrics; one mark per metric."""
     figure, panels = _side_by_side(len(PANELS), 1.15 + 0.27 * len(rows), sharex=True)
     for axes, (title, names) in zip(panels, PANELS.items(), strict=True):
         for metric, within, colour, marker in zip(names, WITHIN, COLOURS, MARKERS, strict=False):
@@ -149,14 +149,14 @@ def rows_figure(rows: Mapping[str, Row]) -> Figure:
 
 
 def is_swept(table: SweepTable, key: str) -> bool:
-    """Whether the table has several numbers of the setting `key`."""
+    """Whether the table has several numeric values of the setting `key`."""
     values = [row.settings.get(key) for row in table.rows]
     numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     return numbers and len(set(values)) > 1
 
 
 def label(settings: Mapping[str, Any]) -> str:
-    """Settings in a few words.
+    """Describe settings briefly.
 
     >>> label({"solver.name": "two_stage", "solver.gamma": 0.3, "solver.second_stage": False})
     'two_stage, gamma 0.3, without second stage'
@@ -179,13 +179,13 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
         by_time = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
         by_count = _panel(table, axis, "R@30 by number of starts", {"": "R@30"})
         return [by_count, _panel(table, axis, by_time, {"": "R@30"}, by_time=True)]
-    if len(table.apart_from(axis)) > 1:  # a colour each
+    if len(table.apart_from(axis)) > 1:  # one colour each
         return [_panel(table, axis, f"{title}, {WITHIN[-1]}", {"": each[-1]}) for title, each in PANELS.items()]
     return [_panel(table, axis, title, dict(zip(WITHIN, each, strict=True))) for title, each in PANELS.items()]
 
 
 def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str], by_time: bool = False) -> Panel:
-    """A curve for each of the settings besides `axis` and each of `metrics` (label to name), ours and the paper's."""
+    """One curve per combination of settings other than `axis` and per metric (label to name), ours and the paper's."""
     curves, over = [], None if by_time else axis
     for rows in table.apart_from(axis):
         words = label({key: value for key, value in rows[0].settings.items() if key != axis})
@@ -199,7 +199,7 @@ def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str],
 
 
 def _curve(title: str, rows: Sequence[Row], axis: str | None, metric: str) -> Curve:
-    """A metric of rows over the setting `axis`, or over the seconds per pair."""
+    """A metric of rows over the setting `axis`, or over seconds per pair."""
     x = [row.metrics.get(SECONDS, Spread(math.nan)).mean if axis is None else float(row.settings[axis]) for row in rows]
     values = [row.metrics[metric] for row in rows]
     mean, std = (np.array([getattr(each, part) for each in values]) for part in ("mean", "std"))
@@ -213,7 +213,7 @@ def _side_by_side(panels: int, height: float, sharex: bool = False) -> tuple[Fig
 
 
 def _legend(figure: Figure) -> None:
-    """Above the panels, in as many columns as fit: about 120 letters, and each key's mark takes the room of 9."""
+    """Add a legend above the panels, with as many columns as fit in 120 characters; each mark takes the width of 9."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     keys = dict(sorted(zip(labels, handles, strict=True), key=lambda key: key[0] == PAPER))  # last
     if keys:

@@ -1,4 +1,4 @@
-"""Finished runs as tables: what varies, mean and spread over their seeds; in print, as files, on a page."""
+"""Finished runs as tables: varying settings, mean and spread over seeds; on the terminal, in files, on a page."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OVER: dict[Objects, str] = {"unique_answer": "objects with a unique answer", "al
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean over seeds and sample standard deviation (n - 1), NaN for a single seed or where it is not finite."""
+    """Mean over seeds and sample standard deviation (n - 1); NaN for a single seed or if not finite."""
 
     mean: float
     std: float = math.nan
@@ -37,7 +37,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Row:
-    """Runs that differ in their seeds alone, or a row of the paper (no runs): what is set of the table's columns."""
+    """Runs that differ only in their seeds, or a row of the paper (no runs); `settings` are those in the columns."""
 
     settings: Mapping[str, Any]
     metrics: Mapping[str, Spread]
@@ -48,15 +48,15 @@ class Row:
 
     @property
     def paper(self) -> bool:
-        """Whether it is the paper's."""
+        """Whether the row is the paper's."""
         return not self.runs
 
 
 @dataclass(frozen=True)
 class SweepTable:
-    """The runs of one experiment (or those without one): a row for every combination of settings.
+    """The runs of one experiment (or those without one): one row per combination of settings.
 
-    `columns` are the settings that vary here or in the paper's own table, `paper`; all runs share those in `common`.
+    `columns` are the settings that vary here or in the paper's table, `paper`; all runs share those in `common`.
     """
 
     experiment: str | None
@@ -66,7 +66,7 @@ class SweepTable:
     paper: PaperTable | None
 
     def apart_from(self, axis: str) -> list[list[Row]]:
-        """The rows in groups, in each of which they differ in nothing but the setting `axis`."""
+        """Group the rows so that within each group only the setting `axis` differs."""
         others = [key for key in self.columns if key != axis]
         groups: dict[str, list[Row]] = {}
         for row in self.rows:
@@ -74,7 +74,7 @@ class SweepTable:
         return list(groups.values())
 
     def papers(self, settings: Mapping[str, Any] | None = None) -> list[Row]:
-        """The paper's rows, all or those to compare a run of these settings with."""
+        """The paper's rows: all, or those comparable to a run with these settings."""
         if self.paper is None:
             return []
         rows = []
@@ -84,13 +84,13 @@ class SweepTable:
         return rows
 
     def with_paper(self) -> list[Row]:
-        """The rows, each followed by the paper's to compare it with; the rest of the paper's are last."""
+        """The rows, each followed by the comparable rows of the paper; the paper's other rows come last."""
         rows = [each for row in self.rows for each in (row, *self.papers(row.settings))]
         return rows + [each for each in self.papers() if each not in rows]
 
 
 def sweep_tables(runs: Sequence[Run], objects: Objects) -> tuple[list[SweepTable], list[LeftOut]]:
-    """A table an experiment, by name, those without one last; and the runs that have nothing to say of `objects`."""
+    """One table per experiment, sorted by name, runs without one last; and the runs without metrics over `objects`."""
     reason = "no object is labelled as having a unique answer; objects=all counts every object"
     left_out = [LeftOut(run.folder, reason) for run in runs if run.metrics[objects] is None]
     runs = [run for run in runs if run.metrics[objects] is not None]
@@ -109,11 +109,11 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The fewest keys that tell the given settings apart, names first.
+    """The fewest keys that distinguish the given settings, names first.
 
-    A key that only some have (a solver's own setting) counts only if it varies among those; and a setting that the
-    choice of its group says (`solver.steps`, where every `solver.name` has its own) is left out. Either comes back
-    where two different settings would look the same without it.
+    A key that only some settings have (e.g. of one solver) counts only if it varies among those. A setting determined
+    by the choice of its group (`solver.steps`, if every `solver.name` has its own) is left out. Either is added back if
+    two different settings would otherwise look the same.
 
     >>> varying([{"solver.name": "a", "solver.steps": 1}, {"solver.name": "b", "solver.steps": 2, "solver.tries": 1}])
     ['solver.name']
@@ -137,7 +137,7 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def in_order(value: Any) -> tuple[int, float, str]:
-    """A sort key for settings: nothing, false, true, numbers by size, everything else as text.
+    """Sort key for settings: None, then booleans and numbers by value, then everything else as text.
 
     >>> sorted([10, "b", None, 9, "a"], key=in_order)
     [None, 9, 10, 'a', 'b']
@@ -148,7 +148,7 @@ def in_order(value: Any) -> tuple[int, float, str]:
 
 
 def heading(key: str) -> str:
-    """A setting as a heading, as it is written on the command line.
+    """A setting's heading, as written on the command line.
 
     >>> heading("solver.name"), heading("solver.gamma")
     ('solver', 'solver.gamma')
@@ -157,7 +157,7 @@ def heading(key: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """A setting's value in a table."""
+    """Format a setting's value for a table."""
     if value is None:
         return "-"
     return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
@@ -193,12 +193,12 @@ def _table(runs: Sequence[Run], experiment: str | None, objects: Objects) -> Swe
 
 
 def _values(settings: Sequence[Mapping[str, Any]], key: str) -> set[str]:
-    """The values of a key, as text, of those that have it."""
+    """The values of a key, as text, in settings that have it."""
     return {json.dumps(each[key]) for each in settings if key in each}
 
 
 class Layout(NamedTuple):
-    """A printed table: the first `labels` headings say what was set, the others are numbers. A line is its cells, and
+    """A printed table: the first `labels` columns are settings, the others are numbers. A line holds its cells and
     whether it is the paper's.
     """
 
@@ -208,7 +208,7 @@ class Layout(NamedTuple):
 
 
 def layout(table: SweepTable) -> Layout:
-    """A line a row, the metrics across; the paper's own rows follow those that they are to be compared with."""
+    """One line per row, one column per metric; the paper's rows follow those they are comparable to."""
     labels = [*map(heading, table.columns), "runs"]
     lines = []
     for row in table.with_paper():
@@ -219,9 +219,9 @@ def layout(table: SweepTable) -> Layout:
 
 
 def terminal(content: Layout, width: int) -> list[Table]:
-    """The layout for a terminal: spreads below the means, shares without the leading zero.
+    """Format for a terminal: spreads below the means, shares without the leading zero.
 
-    Numbers that `width` columns do not hold go on in further tables, each with the labels.
+    Columns that do not fit in `width` continue in further tables, which repeat the labels.
     """
     labels = range(content.labels)
     columns = []
@@ -247,7 +247,7 @@ def terminal(content: Layout, width: int) -> list[Table]:
 
 
 def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]]]:
-    """Columns and rows of all tables in one: a row a combination of settings, and the paper's rows."""
+    """Columns and rows of all tables in one: one row per combination of settings, and the paper's rows."""
     keys = list(dict.fromkeys(key for table in tables for key in table.columns))
     columns = ["experiment", "source", *keys, "runs", "pairs"]
     columns += [f"{name}{part}" for name in METRICS for part in ("", "_std")]
@@ -268,14 +268,14 @@ def _cell(name: str, value: Spread | None) -> str:
 
 
 def _rounded(value: float) -> float | str | None:
-    """A number of a CSV; one that is not known is left empty."""
+    """A number for the CSV file; empty if unknown."""
     if math.isnan(value):
         return None
     return round(value, 5) if math.isfinite(value) else "inf"
 
 
 class Sweep(NamedTuple):
-    """A table of runs with its title, as it is printed, and with the files of its figures."""
+    """A table of runs with its title, its printed layout, and the files of its figures."""
 
     title: str
     table: SweepTable
@@ -284,17 +284,17 @@ class Sweep(NamedTuple):
 
     @property
     def pictures(self) -> list[Path]:
-        """Those of its files that a page can show."""
+        """The files that a page can show."""
         return [file for file in self.files if file.suffix == ".png"]
 
 
 def counted(objects: Objects) -> str:
-    """In words, what the numbers are over."""
+    """What the metrics are over, in words."""
     return f"metrics over {OVER[objects]}; mean and standard deviation over seeds"
 
 
 def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> dict[str, str]:
-    """The sweeps on a page, and the runs that their tables leave out: HTML by title."""
+    """The page's sections for sweeps and for the runs left out of their tables: HTML by title."""
     sections = {sweep.title: render("sweep.html.j2", sweep=sweep) for sweep in sweeps}
     return sections | ({"Left out": render("left_out.html.j2", left_out=left_out)} if left_out else {})
 
@@ -302,7 +302,7 @@ def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> dict
 def write_sweeps(
     folder: Path, sweeps: Sequence[Sweep], left_out: Sequence[LeftOut], objects: Objects, about: Mapping[str, Any]
 ) -> None:
-    """`report.md`, `report.csv` (a row a combination) and `report.json` in `folder`; the last with what `about` has."""
+    """Write `report.md`, `report.csv` (one row per combination) and `report.json` (with `about`) into `folder`."""
     write_csv(folder / "report.csv", *csv_rows([sweep.table for sweep in sweeps]))
     text = render("report.md.j2", sweeps=sweeps, left_out=left_out, counted=counted(objects))
     write_text(folder / "report.md", text)
