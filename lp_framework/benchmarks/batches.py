@@ -1,4 +1,4 @@
-"""Batches of pairs among few views, each view once, against two images per pair: loading, encoding, training."""
+"""Batches that share views among pairs against batches of two images per pair: loading, encoding, training."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from lp_framework.priors.base import Prior
 
 
 def measure_loading(section: Section, data: PairDataModule, new_model: DenoisingModel, rounds: int, steps: int) -> None:
-    """Training steps (forward, backward, optimiser) on batches of either loader, in turn: `steps` a round."""
+    """Time training steps (forward, backward, optimizer) with both loaders in turn: `steps` steps per round."""
     section.title, section.contenders = "loader: a training step", ("pairs in feature space", "plain pair loader")
-    optimizer = torch.optim.Adam(new_model.parameters(), lr=0.0)  # the weights stay, so every step does the same work
+    optimizer = torch.optim.Adam(new_model.parameters(), lr=0.0)  # constant weights, so every step does the same work
 
     def training(batches: Iterator[PairBatch]) -> Work:
         def work() -> float:
@@ -38,7 +38,7 @@ def measure_loading(section: Section, data: PairDataModule, new_model: Denoising
 
     loaders = feature_space(data), plain_pairs(data)
     section.note = f"images of {new_model.backbone.image_size} px, {data.batch_pairs} pairs per batch"
-    kept = [kept_for_backward(new_model, next(batches).to(section.device)) for batches in loaders]  # and a warm-up
+    kept = [kept_for_backward(new_model, next(batches).to(section.device)) for batches in loaders]  # doubles as warm-up
     section.add("memory for backward, kB a pair", kept[0] / 1024, kept[1] / 1024)
     works = {"pairs per second": (training(loaders[0]), training(loaders[1]))}
     section.race(works, rounds, rate=True, warm_up=False)
@@ -47,10 +47,10 @@ def measure_loading(section: Section, data: PairDataModule, new_model: Denoising
 def measure_encoding(
     section: Section, data: PairDataModule, new_model: DenoisingModel, prior: Prior, rounds: int
 ) -> None:
-    """Pairs a second through the model's backbone, through the prior's encoder, and in training on a frozen backbone.
+    """Pairs per second through the model's backbone, through the prior's encoder, and in training with a frozen trunk.
 
-    The last is a step of what is trained then, the head and the network: on features that the trunk computed once,
-    against features of both images of every pair at every step. Batches are drawn beforehand.
+    The last is a training step of the head and the network, with features computed once by the trunk against features
+    of both images of every pair computed at every step. Batches are drawn beforehand.
     """
     section.title, section.contenders = "encoding: the images of pairs", ("each view once", "two images per pair")
     once, plain = next(feature_space(data)), next(plain_pairs(data))
@@ -85,13 +85,13 @@ def measure_encoding(
 
 
 def feature_space(data: PairDataModule) -> Iterator[PairBatch]:
-    """Training batches without end, as the data module gives them."""
+    """Yield training batches of the data module forever."""
     while True:
         yield from data.train_dataloader()
 
 
 def plain_pairs(data: PairDataModule) -> Iterator[PairBatch]:
-    """Pairs drawn at random, two images per pair, as a data set of image pairs gives them."""
+    """Yield random pairs forever, two images per pair, as from a data set of image pairs."""
     views, random = data.data("train"), np.random.default_rng(0)
     everything = views.table.pairs()
     while True:
@@ -99,7 +99,7 @@ def plain_pairs(data: PairDataModule) -> Iterator[PairBatch]:
 
 
 def two_images_a_pair(batch: PairBatch) -> PairBatch:
-    """The batch with images of its own for every pair."""
+    """Copy the batch so that every pair has its own two images."""
     views = torch.stack([batch.reference, batch.query], dim=-1).flatten()
     own = {name: getattr(batch, name)[views] for name in ("pixels", "poses", "cameras", "objects")}
     reference = 2 * torch.arange(len(batch))
@@ -107,7 +107,7 @@ def two_images_a_pair(batch: PairBatch) -> PairBatch:
 
 
 def loss_on(model: DenoisingModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:
-    """The objective of a batch, of its images or of its views' features `[I, D]` where these are given."""
+    """The training loss of a batch, from its images or, if given, from features `[I, D]` of its views."""
     if features is None:
         features = model.encode(batch.images)
     true = batch.relative_poses()
@@ -116,7 +116,7 @@ def loss_on(model: DenoisingModel, batch: PairBatch, features: Tensor | None = N
 
 
 def kept_for_backward(model: DenoisingModel, batch: PairBatch) -> float:
-    """Bytes a pair of the activations that a step keeps for its backward pass."""
+    """Bytes of activations per pair that a step keeps for its backward pass."""
     storages: dict[int, int] = {}
     parameters = {parameter.data_ptr() for parameter in model.parameters()}
 

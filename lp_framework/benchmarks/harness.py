@@ -1,4 +1,4 @@
-"""The harness of `bench`: two contenders at work in turn, and the memory that they take on a GPU."""
+"""The harness of `bench`: time two contenders in turn, and measure their peak GPU memory."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torch import nn
 
 from lp_framework.clock import now
 
-Work = Callable[[], float]  # does it, and returns how many of the row's unit were done
+Work = Callable[[], float]  # does the work, and returns its amount in the row's unit
 _Result = TypeVar("_Result")
 
 
 @dataclass
 class Section:
-    """A measurement so far: `rows` by label with their unit, `facts` for the JSON file alone.
+    """A measurement so far: `rows` by label with unit, and `facts` for the JSON file only.
 
-    A row has a value per round of either contender, or a single one. The measurement sets the title, the contenders'
+    A row has one value per round for each contender, or a single one. The measurement sets the title, the contenders'
     names and the note.
     """
 
@@ -34,9 +34,9 @@ class Section:
     def race(
         self, works: Mapping[str, tuple[Work, Work]], rounds: int, rate: bool = False, warm_up: bool = True
     ) -> None:
-        """Each work once to warm up, then `rounds` of all of them in turn.
+        """Run all works once to warm up, then `rounds` times in turn.
 
-        `works` are the two contenders' by the row's label; values are seconds a unit, units a second if it is a `rate`.
+        `works` maps row labels to the works of both contenders. Values are seconds per unit; if `rate`, the inverse.
         """
         for first, second in works.values() if warm_up else ():
             first()
@@ -48,15 +48,15 @@ class Section:
                     values.append(amount / seconds if rate else seconds / amount)
 
     def add(self, label: str, first: float, second: float) -> None:
-        """A row of single values."""
+        """Add a row of single values."""
         self.rows[label] = [first], [second]
 
     def medians(self) -> dict[str, tuple[float, float]]:
-        """Of the rows of which both contenders have a value."""
+        """Medians of the rows with values of both contenders."""
         return {label: (median(first), median(second)) for label, (first, second) in self.rows.items() if second}
 
     def record(self) -> dict[str, Any]:
-        """For the JSON file: by the labels of the rows, and the facts."""
+        """The rows by label, and the facts, for the JSON file."""
         rows: dict[str, Any] = {}
         for label, (first, second) in self.medians().items():
             rows[label] = {"ratio": first / second}
@@ -66,7 +66,7 @@ class Section:
 
 
 def worth(amount: float, do: Callable[[], object]) -> Work:
-    """Work that is worth so many units."""
+    """Wrap `do` as work of `amount` units."""
 
     def work() -> float:
         do()
@@ -76,14 +76,14 @@ def worth(amount: float, do: Callable[[], object]) -> Work:
 
 
 def timed(work: Callable[[], _Result], device: torch.device) -> tuple[float, _Result]:
-    """Seconds of a piece of work, and what it returns."""
+    """Run the work; returns the seconds and its result."""
     began = now(device)
     result = work()
     return now(device) - began, result
 
 
 def peak_bytes(work: Callable[[], object], weights: nn.Module, device: torch.device) -> int:
-    """The peak of a GPU's memory, in bytes: the weights, and what the work takes. Elsewhere the work is done, and 0."""
+    """Run the work; returns the peak GPU memory in bytes, for the weights and the work. Always 0 on other devices."""
     if device.type != "cuda":
         work()
         return 0

@@ -1,4 +1,4 @@
-"""Views a second of a renderer, with a mesh that is loaded once and with one that is loaded for every view."""
+"""Views per second of a renderer, with the mesh loaded once or loaded again for every view."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lp_framework.geometry import camera_to_world
 
 
 def measure(section: Section, object: str, renderer: Renderer, views: int, resolution: int, rounds: int) -> None:
-    """Views around an embedded object by the chosen renderer, from a mesh file (GLB)."""
+    """Render views around an embedded object with the chosen renderer, from a mesh file (GLB)."""
     objects = {each.name: each for each in toy_objects()}
     if object not in objects:
         raise UserError(f"rendering.object={object} is not one of the embedded objects{among(object, objects)}")
@@ -45,10 +45,10 @@ def around(views: int) -> Tensor:
 
 
 def drawn(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
-    """Views `[V, H, W, 4]` of a mesh file that is loaded once."""
+    """Views `[V, H, W, 4]` of a mesh file loaded once."""
     return renderer.render(load_scene(file), cameras, resolution, FIELD_OF_VIEW_DEGREES)
 
 
 def drawn_one_by_one(renderer: Renderer, file: Path, cameras: Tensor, resolution: int) -> NDArray[np.uint8]:
-    """The same as a plain loop, which loads the file for every view."""
+    """The same in a plain loop that loads the file for every view."""
     return np.concatenate([drawn(renderer, file, each[None], resolution) for each in cameras])

@@ -1,4 +1,4 @@
-"""Both stages with the models that ship: the first one batched against a loop, Gauss-Newton against Adam."""
+"""Both stages with the bundled models: the first batched against a loop, the second by Gauss-Newton against Adam."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.two_stage import GaussNewton, TwoStage
 
-# What both are judged by: the energy under timesteps and noises that neither descends.
+# Both are judged by the energy at timesteps and noises that neither of them minimizes.
 PROBE_TIMESTEPS = (100, 300, 500, 700, 900)
-PROBE_NOISES = 2  # a timestep
+PROBE_NOISES = 2  # per timestep
 PROBE_SEED = 1  # the solvers' is 0
 
 
 @torch.no_grad()
 def plain_loop(solver: Langevin, pairs: Pairs, starts: Tensor) -> Tensor:
-    """`langevin` as a loop over pairs and starts `[B, N, 3]`; its final poses `[B, N, 3]`, longitudes unreduced."""
+    """`langevin` as a loop over pairs and starts `[B, N, 3]`; returns poses `[B, N, 3]` with unwrapped longitudes."""
     model, ends = solver.model, torch.empty_like(starts)
     gamma = starts.new_tensor(solver.gamma)
     for pair in range(len(pairs)):
@@ -45,7 +45,7 @@ def plain_loop(solver: Langevin, pairs: Pairs, starts: Tensor) -> Tensor:
 
 
 def measure_first_stage(section: Section, model: PoseModel, views: int, starts: int, rounds: int) -> None:
-    """On all ordered pairs of `views` random images, `starts` each, and on one of these pairs."""
+    """Solve all ordered pairs of `views` random images from `starts` each, and one of these pairs."""
     section.title, section.contenders = "first stage: langevin", ("batched", "plain loop")
     solver = Langevin(model)
 
@@ -62,14 +62,14 @@ def measure_first_stage(section: Section, model: PoseModel, views: int, starts: 
 
 
 def all_pairs(side: int, views: int, device: torch.device) -> Pairs:
-    """All ordered pairs of random images, `side` pixels a side."""
+    """All ordered pairs of random images, `side` pixels per side."""
     reference, query = torch.tensor(list(permutations(range(views), 2)), device=device).T
     images = torch.rand(views, 3, side, side, device=device) * 2 - 1
     return Pairs(images, reference, query, torch.arange(len(reference), device=device))
 
 
 def some_pairs(views: PairData, count: int, device: torch.device) -> Pairs:
-    """So many of the ordered pairs of views, spread evenly over the objects."""
+    """Pick `count` of the ordered pairs of views, spread evenly over the objects."""
     every = views.table.pairs("ordered")
     chosen = every[np.linspace(0, len(every), min(count, len(every)), endpoint=False, dtype=int)]
     return pairs_of(views[chosen], device)
@@ -79,9 +79,9 @@ def measure_descent(
     section: Section, data: PairDataModule, model: PoseModel, prior: Prior, pairs: int, starts: int,
     gammas: Sequence[float], newton_steps: int, adam_steps: int,
 ) -> None:  # fmt: skip
-    """Descents on `pairs` of the test views from where the first stage ends under each of `gammas`.
+    """Descend on `pairs` pairs of test views, starting where the first stage ends for each of `gammas`.
 
-    A gamma is the noise of the first stage's longitudes; equal energy is the lowest that both reach.
+    A gamma is the first stage's noise in longitude; "equal energy" is the lowest energy that both reach.
     """
     section.title, section.contenders = "second stage: Gauss-Newton and Adam", ("Gauss-Newton", "Adam")
     chosen = some_pairs(data.data("test"), pairs, section.device)
@@ -107,16 +107,16 @@ def measure_descent(
 
 
 def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
-    """At the start and after each step of a solution: mean energies on the probe, and network passes per start so far.
+    """Mean probe energies and cumulative network passes per start, at the start and after each step of a solution.
 
-    Before its first step it has passed the network `looks` times as often as in each.
+    Before its first step, the solver spends `looks` times the passes of one step.
     """
     path = solution.trajectory
-    assert path is not None  # it was asked for
+    assert path is not None  # it was requested
     energy = PairEnergy(prior, pairs, PROBE_SEED)
     timesteps = [timestep for timestep in PROBE_TIMESTEPS for _ in range(PROBE_NOISES)]
     noise = energy.noise(0, len(timesteps))
     energies = [energy.mean(poses, timesteps, noise).mean().item() for poses in path.unbind(dim=2)]
     steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
-    passes = (solution.cost.network_passes - len(pairs.images)) / starts  # those that encode the images are not counted
+    passes = (solution.cost.network_passes - len(pairs.images)) / starts  # excludes the encoding of images
     return energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)]

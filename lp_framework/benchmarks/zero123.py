@@ -1,4 +1,4 @@
-"""Zero123 with random weights, at its full or at a narrow size: batched against a loop, and in reduced precision."""
+"""Zero123 with random weights, at full or narrow size: batched against a loop, and in reduced precision."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from lp_framework.solvers.starts import Ring
 from lp_framework.solvers.twist import IFusion, SineRadius, TwistPoses
 from lp_framework.solvers.two_stage import TwoStage
 
-TIMESTEP = 500  # the work is that of any other
+TIMESTEP = 500  # any timestep takes the same work
 CONTENDERS = BATCHED, LOOP = "batched", "plain loop"
 SWITCHES = ("channels_last", "compile", "cuda_graph")
 
 Architecture = Literal["published", "narrow"]
-NARROW: Configs = {  # the same layers, few and narrow: to try the measurement in seconds
+NARROW: Configs = {  # the same kinds of layers, fewer and narrower: tries the measurement in seconds
     "unet": unet_config([32, 32], 1, [True, False], heads=4, context=32),
     "vae": vae_config([32, 32, 32, 32], 1),
     "image_encoder": clip_config(width=64, layers=1, patch=32, image_size=224, projection=32),
@@ -48,7 +48,7 @@ ARCHITECTURES: Mapping[Architecture, Configs] = {"published": PUBLISHED, "narrow
 
 @dataclass(frozen=True)
 class Computing:
-    """How Zero123 computes: its size, and settings of `prior=zero123`."""
+    """How Zero123 is computed: its size, and settings of `prior=zero123`."""
 
     architecture: Architecture = "published"
     dtype: Dtype = "float32"
@@ -64,36 +64,36 @@ class Computing:
             return Networks(ARCHITECTURES[self.architecture])
 
     def prior(self, networks: Networks) -> Zero123Prior:
-        """A prior with the weights of these networks, whose memory it shares where nothing converts them."""
-        # New parameters around the same storage: a conversion of one does not reach the other.
+        """A prior with the weights of these networks. It shares their memory unless they are converted."""
+        # New parameters with the same storage: converting one does not affect the other.
         shared: dict[int, Any] = {id(each): nn.Parameter(each.detach(), False) for each in networks.parameters()}
         own = copy.deepcopy(networks, shared)
         for part in (own.unet, own.vae, own.image_encoder):
-            nn.Module.to(part, DTYPES[self.dtype])  # diffusers' own `to` warns of nothing
+            nn.Module.to(part, DTYPES[self.dtype])  # diffusers' own `to` warns needlessly
         settings = self.channels_last, self.compile, self.cuda_graph, self.attention, self.max_batch
         return Zero123Prior(own, *settings).to(own.cc_projection.weight.device)
 
 
 def random_pair(device: torch.device) -> Pairs:
-    """A pair of random images of Zero123's size."""
+    """A pair of random images at Zero123's size."""
     index = torch.arange(2, device=device)
     return Pairs(torch.rand(2, 3, IMAGE_SIZE, IMAGE_SIZE, device=device) * 2 - 1, index[:1], index[1:], ids=index[:1])
 
 
 def encoded(prior: Prior, codes: ViewCode) -> Prior:
-    """The prior, for images that have been encoded before: neither contender is charged for them."""
+    """The prior with precomputed image codes, so that encoding counts for neither contender."""
     ready = copy.copy(prior)
     ready.encode = lambda images: codes  # type: ignore[method-assign]
     return ready
 
 
 def batched(prior: Prior, pair: Pairs, starts: Tensor, steps: int) -> Work:
-    """Steps of this package's `ifusion` from starts `[1, N, 3]`: all of them and both directions in one batch."""
+    """Steps of this package's `ifusion` from starts `[1, N, 3]`, with all starts and both directions in one batch."""
     return worth(steps, partial(IFusion(prior, steps).solve, pair, starts, 0))
 
 
 def plain_prior(networks: Networks) -> Zero123Prior:
-    """In float32, with attention that spells out its weights: softmax(Q K^T / sqrt(d)) V."""
+    """A float32 prior with attention that materializes its weights: softmax(Q K^T / sqrt(d)) V."""
     from diffusers.models.attention_processor import AttnProcessor
 
     prior = Computing().prior(networks)
@@ -102,12 +102,12 @@ def plain_prior(networks: Networks) -> Zero123Prior:
 
 
 class PlainLoop:
-    """One start `[3]` of a sequential loop, its costs those of iFusion's published code (`optimize_pose_loop`).
+    """One start `[3]` of a sequential loop that costs as much as iFusion's published code (`optimize_pose_loop`).
 
-    As there: both images are encoded anew at every step, by the autoencoder once as targets and once as conditions,
-    by CLIP as conditions; float32; both directions in one batch of two; attention that spells out its weights; a twist
-    that lives on the CPU; a loss that is read at every step, for the plateau scheduler. Left out, and next to free:
-    condition dropout, sampling of the posterior, the progress bar.
+    As in that code, every step encodes both images again, by the autoencoder as targets and as conditions and by CLIP
+    as conditions; uses float32, a batch of both directions, and attention that materializes its weights; keeps the
+    twist on the CPU; and reads the loss for the plateau scheduler. Left out, since nearly free: condition dropout,
+    posterior sampling, the progress bar.
     """
 
     def __init__(self, prior: Zero123Prior, images: Tensor, start: Tensor) -> None:
@@ -122,13 +122,13 @@ class PlainLoop:
         """Mean squared error of both directions for a pose `[3]` and noise `[2, *latent_shape]`."""
         source = self.prior.encode(self.condition)  # VAE and CLIP
         latent = self.prior.vae.encode(self.target).latent_dist.mode()  # VAE
-        target = ViewCode(latent, source.embedding)  # a target's embedding is not read
+        target = ViewCode(latent, source.embedding)  # a target's embedding is unused
         poses = torch.stack([pose, -pose]).to(noise.device)
         timestep = torch.full((2,), TIMESTEP, device=noise.device)
         return self.prior.residual(target, source, poses, timestep, noise).square().mean()
 
     def step(self) -> None:
-        """One update of the start."""
+        """Update the start once."""
         self.optimizer.zero_grad()
         noise = torch.randn(2, *self.prior.latent_shape, device=self.condition.device)
         loss = self.loss(self.poses(self.twist), noise)
@@ -139,25 +139,25 @@ class PlainLoop:
 
 
 def looped(loops: Sequence[PlainLoop], steps: int) -> None:
-    """Steps of each start, one start after the other."""
+    """Run `steps` steps of one start after the other."""
     for loop in loops:
         for _ in range(steps):
             loop.step()
 
 
 def measure_step(section: Section, computing: Computing, starts: Sequence[int], rounds: int, steps: int) -> None:
-    """Optimisation steps on random weights; `computing` is how the batch is computed, the loop is as published."""
+    """Time optimization steps on random weights: a batch computed as `computing` against the loop as published."""
     section.title, section.contenders = "second stage: a step of one pair", CONTENDERS
     device = section.device
     networks, pair = computing.networks(device), random_pair(device)
     batch_prior, loop_prior = computing.prior(networks), plain_prior(networks)
     if device.type == "cuda":
-        batch_prior.encode(pair.images)  # the first time prepares it
+        batch_prior.encode(pair.images)  # warm-up
     encoding, codes = timed(lambda: batch_prior.encode(pair.images), device)
     ready = encoded(batch_prior, codes)
     ring = {count: Ring(count).make(pair, seed=0) for count in starts}
     loops = [PlainLoop(loop_prior, pair.images, start) for start in ring[max(starts)][0]]
-    # A step of some size is prepared when it is first taken; recorded, it takes its memory then.
+    # The first step at each size compiles or records the graph, and recording allocates its memory.
     peaks = {count: peak_bytes(batched(ready, pair, poses, 1), batch_prior, device) for count, poses in ring.items()}
     loop_peak = peak_bytes(loops[0].step, loop_prior, device)
     for count, peak in peaks.items() if device.type == "cuda" else ():
@@ -182,10 +182,10 @@ def measure_pair(
     section: Section, computing: Computing, model: PoseModel, paper_seconds: Mapping[int, float],
     starts: Sequence[int], steps: int, rounds: int,
 ) -> None:  # fmt: skip
-    """`two_stage` with `steps` steps of its second stage against the second stage alone by `PlainLoop`.
+    """Time `two_stage` with `steps` steps of its second stage against only the second stage in `PlainLoop`.
 
-    The first computes as `computing` says and encodes the images of each pair. The first pair of a number of starts, in
-    which kernels are chosen, compiled or recorded, is told apart. `paper_seconds` are the paper's by number of starts.
+    The former follows `computing` and encodes the images of each pair. The first pair at each number of starts, which
+    chooses, compiles or records kernels, is reported separately. `paper_seconds` are the paper's by number of starts.
     """
     section.title, section.contenders = "pair: both stages and encoding", CONTENDERS
     networks, pair = computing.networks(section.device), random_pair(section.device)
@@ -219,7 +219,7 @@ def told(starts: int) -> str:
 
 
 def variant(words: str, architecture: Architecture, max_batch: int | None) -> Computing:
-    """Of words such as "bfloat16 channels_last compile", in any order; the dtype is float32 where none is named."""
+    """Parse words such as "bfloat16 channels_last compile", in any order; the dtype defaults to float32."""
     chosen, known = words.split(), [*DTYPES, *SWITCHES]
     dtypes = [word for word in chosen if word in DTYPES]
     if not chosen or len(dtypes) > 1 or not {*chosen} <= {*known}:
@@ -234,7 +234,7 @@ def measure_precision(
     section: Section, architecture: Architecture, variants: Sequence[str], starts: int, rounds: int, steps: int,
     max_batch: int | None,
 ) -> None:  # fmt: skip
-    """Steps of a pair on the same random weights, a variant after the other, so that two U-Nets are held at most."""
+    """Time steps of a pair with the same random weights, one variant at a time to hold at most two U-Nets."""
     section.title, section.contenders = "precision: a step of one pair", ("as named", "plain float32")
     device, plain = section.device, Computing(architecture, max_batch=max_batch)
     computings = {words: variant(words, architecture, max_batch) for words in variants}
@@ -244,13 +244,13 @@ def measure_precision(
     codes = prior.encode(pair.images)
     ready = encoded(prior, codes)
     memory = peak_bytes(partial(gradient, ready, pair, poses), prior.unet, device)
-    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # in which a GPU convolves float32 otherwise
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # a GPU convolves float32 in TF32 otherwise
         exact = gradient(ready, pair, poses)
     section.note = f"Zero123's {architecture} size, random weights, {starts} starts"
     for words, computing in computings.items():
         other = computing.prior(networks)
         theirs = encoded(other, codes)
-        # The first step: once recorded it takes no more memory.
+        # Measured at the first step: once recorded, later steps allocate nothing.
         its_memory = peak_bytes(partial(gradient, theirs, pair, poses), other.unet, device)
         off = ((gradient(theirs, pair, poses) - exact).abs().max() / exact.abs().max()).item()
         section.note += f"; {words}: gradient off by {off:.1g}"
@@ -263,6 +263,6 @@ def measure_precision(
 
 
 def gradient(prior: Prior, pair: Pairs, poses: Tensor) -> Tensor:
-    """Of the energies in the poses `[1, N, 3]`."""
+    """Gradient of the energies at poses `[1, N, 3]`."""
     energy, poses = PairEnergy(prior, pair, seed=0), poses.detach().clone().requires_grad_()
     return torch.autograd.grad(energy(poses, TIMESTEP, energy.noise(0)[:, 0]).sum(), poses)[0]
