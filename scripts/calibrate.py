@@ -1,11 +1,11 @@
-"""Fit the temperature of a matching model on the embedded objects, none of which it has met.
+"""Fit the temperature of a matching model on the embedded objects, which it was not trained on.
 
     python -m lp_framework render data=toy
     python -m lp_framework convert path=runs/general output=general dtype=float16
     python scripts/calibrate.py general datasets/toy
 
-It is that of the greatest likelihood of the true longitudes, over all ordered pairs of test views of objects with a
-unique answer, whole and cropped as photographs are; `general/model.json` gets it.
+It maximizes the likelihood of the true longitudes over all ordered pairs of test views of objects with a unique answer,
+both full and cropped like photographs, and writes it to `general/model.json`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TEMPERATURES = torch.arange(1.0, 4.01, 0.05)
 
 
 def densities(model_folder: Path, views_folder: Path) -> tuple[PoseDensity, torch.Tensor]:
-    """At temperature 1, of all pairs, and their true differences of longitude."""
+    """Densities of all pairs at temperature 1, and the true longitude differences."""
     model, source = load_model(model_folder), RenderingsData(str(views_folder))
     model.temperature = 1.0  # type: ignore[assignment]
     logits, true = [], []

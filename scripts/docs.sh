@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Build the documentation as a website, strictly: warnings are errors. An argument names the folder, else build/docs.
+# Build the documentation as a website; warnings are errors. Usage: bash scripts/docs.sh [FOLDER, default build/docs]
 set -euo pipefail
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh

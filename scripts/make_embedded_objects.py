@@ -1,4 +1,4 @@
-"""Make the embedded objects anew: lp_framework/data/toy/NAME.npz, as `lp_framework.data.toy` reads them."""
+"""Rebuild the embedded objects: lp_framework/data/toy/NAME.npz, read by `lp_framework.data.toy`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FOLDER = Path(__file__).parents[1] / "lp_framework" / "data" / "toy"
 
 
 def packed(scene: trimesh.Scene) -> dict[str, NDArray]:
-    """The arrays of a scene whose meshes all have textures; a texture that several wear is kept once."""
+    """The arrays of a scene whose meshes all have textures; a shared texture is stored once."""
     meshes, textures = list(scene.geometry.values()), []
     parts = []
     for mesh in meshes:
@@ -38,14 +38,14 @@ def packed(scene: trimesh.Scene) -> dict[str, NDArray]:
 
 
 def main() -> None:
-    """Make and write them; the same files each time."""
+    """Write the objects; the files are reproducible."""
     for name, make in TOYS.items():
         file = FOLDER / f"{name}.npz"
         with zipfile.ZipFile(file, "w") as archive:
             for key, array in packed(make()).items():
                 content = io.BytesIO()
                 np.save(content, array)
-                entry = zipfile.ZipInfo(f"{key}.npy")  # of 1980, whenever it is written
+                entry = zipfile.ZipInfo(f"{key}.npy")  # dated 1980, for reproducible files
                 how = zipfile.ZIP_STORED if key.startswith("texture") else zipfile.ZIP_LZMA
                 archive.writestr(entry, content.getvalue(), how)
         print(f"{file}: {file.stat().st_size / 1000:.0f} KB")

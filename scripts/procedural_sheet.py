@@ -1,4 +1,4 @@
-"""The contact sheet docs/pictures/procedural.png: the first objects of `data=procedural`, a view of each."""
+"""Draw the contact sheet docs/pictures/procedural.png: one view of each of the first objects of `data=procedural`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ POSE = (0.4, 0.5, 1.6)  # latitude, longitude (radians), radius (scene units)
 
 
 def main() -> None:
-    """Draw and write it."""
+    """Draw and save it."""
     renderer, camera = AutoRenderer(), camera_to_world(torch.tensor([POSE], dtype=torch.float64))
     sheet = Image.new("RGB", (COLUMNS * SIZE, ROWS * SIZE), "white")
     for index, (row, column) in enumerate(np.ndindex(ROWS, COLUMNS)):

@@ -1,4 +1,4 @@
-"""Record docs/pictures/explore.gif: the tab Explore of the web app, used by a headless Chromium.
+"""Record docs/pictures/explore.gif: the Explore tab of the web app, driven by headless Chromium.
 
 python scripts/record_app.py        # needs the extras app and dev, and a Chromium on the PATH
 """
@@ -18,7 +18,7 @@ from playwright.sync_api import Page, sync_playwright
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "explore.gif"
 WIDTH, HEIGHT = 1000, 1080  # of the window
 PLACES = [(0.30, 0.62), (0.62, 0.30), (0.86, 0.70)]  # where the map is clicked, as shares of its width and height
-SECONDS = 1.6  # a frame
+SECONDS = 1.6  # per frame
 SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -52,13 +52,13 @@ def frames(page: Page, address: str) -> list[Image.Image]:
 
 
 def shot(page: Page) -> Image.Image:
-    """The window, in the colours that a GIF can have."""
+    """The window, in the palette of a GIF."""
     image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     return image.quantize(255, dither=Image.Dither.NONE)
 
 
 def main() -> None:
-    """Serve the app, use it, write the picture."""
+    """Serve the app, use it, and save the picture."""
     command = [sys.executable, "-m", "lp_framework", "app", "port=0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as app, sync_playwright() as playwright:
         assert app.stdout is not None

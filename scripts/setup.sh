@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Make .venv: this package, editable, at the versions of constraints.txt, with all that its tests need. Quick when done.
-# An argument names other extras of pyproject.toml, or none: bash scripts/setup.sh features,zero123; bash scripts/setup.sh ""
+# Create .venv: this package (editable) and its test dependencies, as pinned in constraints.txt. Fast if up to date.
+# Pass other extras of pyproject.toml, or none: bash scripts/setup.sh features,zero123; bash scripts/setup.sh ""
 # PYTHON=python3.12 bash scripts/setup.sh chooses the interpreter.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -9,7 +9,7 @@ extras="${1-dev}"
 fail() { echo "setup: $1" >&2; exit 1; }
 new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; }
 
-stamp=".venv/installed"  # holds the extras and a sum of the files that say which packages they are
+stamp=".venv/installed"  # holds the extras and a checksum of the files that define the packages
 sum="$(cat pyproject.toml constraints.txt | cksum)"
 found="$(cat "$stamp" 2>/dev/null || true)"
 if [ "$found" = "$extras $sum" ] || { [ -z "$extras" ] && [ "${found#* }" = "$sum" ]; }; then
@@ -30,7 +30,7 @@ if ! .venv/bin/python -c '' 2>/dev/null; then
     "$PYTHON" -m venv --clear .venv || fail "$PYTHON -m venv did not work (Debian and Ubuntu: apt install python3-venv)"
 fi
 echo "setup: installing the packages of constraints.txt (some minutes the first time)"
-# Of 20,000 modules a quarter is ever used: those are compiled when they are first imported.
+# Only a quarter of the 20,000 modules is ever used; Python compiles those at first import.
 .venv/bin/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt -e ".${extras:+[$extras]}" \
     || fail "the packages could not be installed"
 echo "$extras $sum" > "$stamp"

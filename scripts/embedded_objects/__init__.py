@@ -1,6 +1,6 @@
-"""The twelve embedded objects as functions, each of which builds its normalised scene; in modules by ambiguity class.
+"""The twelve embedded objects: one function per object builds its normalized scene; one module per ambiguity class.
 
-Toys with a front face +Z or drive towards +X. `make_embedded_objects.py` writes what they build into the package.
+Toys with a front face +Z or drive towards +X. `make_embedded_objects.py` writes the scenes into the package.
 """
 
 from embedded_objects.continuous import celadon_bottle, lotus_vase, soup_can

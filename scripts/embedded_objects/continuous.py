@@ -1,4 +1,4 @@
-"""The embedded objects whose shape is symmetric under any turn; the texture of the first alone tells the longitude."""
+"""Embedded objects with rotationally symmetric shapes; only the first one's texture determines the longitude."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lp_framework.data.procedural.solids import curve, hollow, lathe, scene, tor
 
 
 def soup_can() -> trimesh.Scene:
-    """A tin of tomato soup; its label is different all the way round."""
+    """A tin of tomato soup whose label differs all the way around."""
     label, draw = tx.canvas(2048, 720, tx.CREAM)
     draw.rectangle([0, 0, 2048, 330], fill=tx.RED)
     draw.rectangle([0, 322, 2048, 338], fill=tx.MUSTARD)
@@ -74,8 +74,8 @@ REPEATS = 16  # of the pattern, around the vase
 
 
 def lotus_vase() -> trimesh.Scene:
-    """A painted vase; its pattern repeats `REPEATS` times around it."""
-    wide, high = 256, 2048  # of one repeat, which is then reduced
+    """A painted vase whose pattern repeats `REPEATS` times around it."""
+    wide, high = 256, 2048  # of one repeat, downsampled later
     tile, draw = tx.canvas(wide, high, tx.CREAM)
 
     def level(top: int, bottom: int, colour: tx.Colour) -> None:
@@ -128,7 +128,7 @@ def lotus_vase() -> trimesh.Scene:
 
 
 def celadon_bottle() -> trimesh.Scene:
-    """A plain glazed bottle: its colour depends on the height alone, darker where the glaze gathers."""
+    """A plain glazed bottle whose colour depends only on the height, darker where the glaze gathers."""
     radii = [0.3, 0.33, 0.31, 0.44, 0.5, 0.4, 0.19, 0.14, 0.15, 0.24]
     heights = [0, 0.03, 0.08, 0.24, 0.44, 0.66, 0.82, 1.0, 1.16, 1.28]
     profile, share = hollow(curve(np.transpose([radii, heights]), 73), 0.03)

@@ -1,4 +1,4 @@
-"""Painted textures: a palette, patterned grounds, lettering, and the sheets that boxes and slabs wear."""
+"""Painted textures: a palette, patterned backgrounds, lettering, and texture sheets for boxes and slabs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ GLASS: Colour = (64, 92, 112)
 def canvas(
     width: int, height: int, colour: Colour, strength: float = 0.0, seed: int = 0, cells: int = 12
 ) -> tuple[Image.Image, ImageDraw.ImageDraw]:
-    """A ground of one colour, uneven as `mottle` makes it if it has a `strength`, and a pen to draw on it."""
+    """A background of one colour, made uneven by `mottle` if `strength` is given, and a pen to draw on it."""
     image = Image.new("RGB", (width, height), colour)
     if strength:
         image = mottle(image, strength, seed, cells)
@@ -47,7 +47,7 @@ def canvas(
 
 
 def planks(colour: Colour, width: int = 512, height: int = 512, rows: int = 6, seed: int = 0) -> Image.Image:
-    """Boards lying one above the other, each of its own tone, with dark joints and nail heads."""
+    """Boards one above the other, each in its own shade, with dark joints and nail heads."""
     image = wood(colour, width, height, seed)
     tones = 1 + np.random.default_rng(seed).uniform(-0.14, 0.10, rows)
     row = np.minimum(np.arange(height) * rows // height, rows - 1)
@@ -62,7 +62,7 @@ def planks(colour: Colour, width: int = 512, height: int = 512, rows: int = 6, s
 
 
 def courses(width: int, height: int, rows: Sequence[int], of: int, proportion: float) -> Iterator[tuple[float, ...]]:
-    """Places of bricks or tiles in running bond: left, top, length and height of each in some of `of` rows."""
+    """Positions of bricks or tiles in running bond: left, top, length and height of each, in some of `of` rows."""
     high = height / of
     columns = max(2, round(width / (proportion * high)))
     long = width / columns
@@ -74,7 +74,7 @@ def courses(width: int, height: int, rows: Sequence[int], of: int, proportion: f
 def bricks(
     colour: Colour, mortar: Colour, width: int = 512, height: int = 512, rows: int = 12, seed: int = 0
 ) -> Image.Image:
-    """A wall in running bond, every brick of its own tone."""
+    """A wall in running bond, each brick in its own shade."""
     image, draw = canvas(width, height, mortar)
     random = np.random.default_rng(seed)
     for x, y, long, high in courses(width, height, range(rows), rows, 2.2):
@@ -156,7 +156,7 @@ def box_sheet(
     bottom: Image.Image,
     cell: int = 448,
 ) -> Image.Image:
-    """The texture of `solids.box`: six pictures, each as seen from outside (the top from above, the front below)."""
+    """The texture of `solids.box`: six pictures as seen from outside (the top seen from above with the front below)."""
     sheet = Image.new("RGB", (3 * cell, 2 * cell))
     for index, picture in enumerate((front, right, back, left, top, bottom)):
         place = (index % 3 * cell, index // 3 * cell)

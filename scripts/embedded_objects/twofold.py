@@ -1,4 +1,4 @@
-"""The embedded objects whose shape is symmetric under a half turn, and their texture not."""
+"""Embedded objects whose shape is symmetric under a half turn but whose texture is not."""
 
 from __future__ import annotations
 

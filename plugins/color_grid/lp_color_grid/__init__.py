@@ -13,8 +13,8 @@ from lp_framework.registry import register
 class ColorGrid(Backbone):
     """Mean colours on a coarse grid, and one trainable layer: a baseline that sees where colours are, but no shapes.
 
-    The constructor's arguments are the settings (`backbone.grid=8`), the first line above is the description in
-    `lp plugins`. The trunk has nothing to train, so it is `frozen`: its features are computed once an image and kept.
+    The constructor's arguments are the settings (`backbone.grid=8`), and the first line above is the description in
+    `lp plugins`. The trunk has no parameters, so it is `frozen`: its features are computed once per image and cached.
     """
 
     def __init__(self, grid: int = 4, features: int = 128, image_size: int = 64) -> None:
@@ -26,7 +26,7 @@ class ColorGrid(Backbone):
         self.head = nn.Sequential(nn.Linear(self.trunk_dim, features), nn.ReLU())
 
     def trunk_module(self) -> nn.Module:
-        """The part that is frozen."""
+        """The frozen part."""
         return self.colors
 
     def trunk_features(self, images: Tensor) -> Tensor:
