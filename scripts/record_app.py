@@ -1,6 +1,6 @@
 """Record docs/pictures/explore.gif: the Explore tab of the web app, driven by headless Chromium.
 
-python scripts/record_app.py        # needs the extras app and dev, and a Chromium on the PATH
+python scripts/record_app.py        # needs the extras app and dev, and Chromium on the PATH
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from playwright.sync_api import Page, sync_playwright
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "explore.gif"
 WIDTH, HEIGHT = 1000, 1080  # of the window
-PLACES = [(0.30, 0.62), (0.62, 0.30), (0.86, 0.70)]  # where the map is clicked, as shares of its width and height
+PLACES = [(0.30, 0.62), (0.62, 0.30), (0.86, 0.70)]  # of clicks on the map, as fractions of its width and height
 SECONDS = 1.6  # per frame
 SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 

@@ -45,7 +45,7 @@ def within(energies: Tensor, azimuths: Tensor, truth: Tensor) -> Tensor:
 
 
 class Profile(NamedTuple):
-    """The mean energy around an object `[A]` over the azimuth's distance from the truth `[A]` (degrees, -180 first)."""
+    """Mean energy around an object `[A]` over the azimuth's offset from the truth `[A]` (degrees, from -180 up)."""
 
     degrees: Tensor
     energy: Tensor

@@ -38,7 +38,7 @@ class Draws(NamedTuple):
         return [timestep for timestep in self.timesteps for _ in range(self.noises)]
 
     def in_words(self) -> str:
-        """A sentence for captions.
+        """Describe the draws in a sentence.
 
         >>> Draws([100, 900], 5, seed=0).in_words()
         'Mean over both directions of the pair, timesteps 100, 900 and 5 noises at each.'
@@ -104,7 +104,7 @@ def prior_landscapes(prior: Prior, pairs: Pairs, radius: Tensor, grid: Grid, dra
 def pose_energies(prior: Prior, pairs: Pairs, poses: Tensor, draws: Draws) -> Tensor:
     """A prior's energies `[B, N]` of relative poses `[B, N, 3]`; shows a progress bar inside `shown_progress`."""
     steps, codes = draws.steps(), prior.encode(pairs.images)
-    # Several pairs at once, or some poses of one pair.
+    # Each pass takes several pairs, or part of the poses of one pair.
     groups = torch.arange(len(pairs), device=poses.device).split(max(1, draws.batch // poses.shape[1]))
     parts = torch.arange(poses.shape[1], device=poses.device).split(draws.batch)
     tasks = [(group, part) for group in groups for part in parts]
@@ -146,7 +146,7 @@ def generated_views(
     """Views `[N, H, W, 3]` in [0, 1] from one image's code at relative poses `[N, 3]`, by DDIM with shared draws."""
     parts = []
     for number in steps_of(math.ceil(len(poses) / batch), "generated views"):
-        generator = torch.Generator().manual_seed(seed)  # on the CPU: a GPU gets the same draws
+        generator = torch.Generator().manual_seed(seed)  # on the CPU, so that a GPU gets the same draws
         pose = poses[number * batch : (number + 1) * batch].to(source.latent)
         repeated = source[torch.zeros(len(pose), dtype=torch.int64, device=pose.device)]
         parts.append(prior.generate(repeated, pose, steps, guidance, generator, eta).float().cpu())

@@ -1,1 +1,1 @@
-"""What `bench` measures, a module each, with the one harness that times contenders side by side."""
+"""The measurements of `bench`, one module each, and the shared harness that times both contenders."""

@@ -42,7 +42,7 @@ class Row:
     settings: Mapping[str, Any]
     metrics: Mapping[str, Spread]
     seeds: Sequence[int] = ()
-    runs: Sequence[str] = ()  # their folders
+    runs: Sequence[str] = ()  # folders of the runs
     pairs: int | None = None
     source: str = "runs"
 

@@ -141,7 +141,7 @@ def cameras_figure(
     scene = Scene(upper.subplots(), best_viewpoint(poses), furthest)
     for place, (x, y) in enumerate(scene.project(1.09 * furthest * SPOKES[::3])):
         scene.axes.text(x, y, f"{90 * place}°", color=style.MUTED, fontsize=7, ha="center", va="center", zorder=2)
-    scene.image(images[0], image_plane(cameras[0], float(poses[0, 2]), half_angle), order=100.0)  # through the object
+    scene.image(images[0], image_plane(cameras[0], float(poses[0, 2]), half_angle), order=100.0)  # inside the object
     for camera, image, number, colour in zip(cameras, images, numbers, colours, strict=True):
         _draw_camera(scene, camera[:3, 3], image_plane(camera, distance, half_angle), shrunk(image), colour)
         x, y = scene.project(camera[:3, 3])

@@ -255,7 +255,7 @@ def _draw_surface(axes: Axes3D, landscape: Landscape, truth: NDArray | None) -> 
     axes.set_ylabel("relative latitude", labelpad=-2)
     axes.set_zlabel("denoising error", labelpad=-2)
     axes.xaxis.set_major_locator(MultipleLocator(60))
-    # The corner belongs to 360 degrees.
+    # No ticks at the ends: the corner shows the label of 360 degrees.
     axes.set_yticks([each for each in range(-150, 180, 30) if latitude[0] + 1 < each < latitude[-1] + 1])
     axes.set_zticks([each for each in MaxNLocator(4).tick_values(low, high) if low <= each <= high])
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
