@@ -38,7 +38,7 @@ def run(config: DictConfig) -> None:
     draws = Draws(TIMESTEPS, noises=1, seed=config.seed)
     bench = Workbench(device, data, Choice(settings.pop("name"), settings), draws, first, config.seed)
     jobs, visitors = Jobs(), Visitors()
-    planned = config.data.get("test_views")  # None: the views are there already
+    planned = config.data.get("test_views")  # None: the views already exist
     views = {name: planned or len(data.source.views(name, "test")) for name in data.source.names()}
     app = make_app(bench, jobs, visitors, config.object, views, Path(config.folder), most)
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # else it prints a line per request
