@@ -83,8 +83,8 @@ def assert_the_same(ran: Ran, wanted: Ran) -> None:
 
 def went_on(ran: Ran) -> int:
     """The number of pairs that were there."""
-    (line,) = (line for line in ran.out.splitlines() if line.startswith("going on: "))
-    return int(line.split()[2])
+    (line,) = (line for line in ran.out.splitlines() if line.startswith("resuming: "))
+    return int(line.split()[1])
 
 
 # ---------------------------------------------------------------- stopped and gone on
@@ -189,7 +189,7 @@ def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, 
     said = (
         rf"{name}/{file}: cannot be written \(No space left on device: it needs more than the [\d.]+ MB that are free\)"
     )
-    assert re.fullmatch(f"{said}; make room, then resume={name} goes on", ran.error)
+    assert re.fullmatch(f"{said}; make room, then resume={name} resumes it", ran.error)
     again = commands.here("unused", "eval", f"resume={name}", "pictures=false")
     assert went_on(again) == (4 * BATCH if place == "journal" else PAIRS)
     again.folder = commands.folder / name
@@ -210,7 +210,7 @@ def test_a_command_that_a_scheduler_ends_says_how_it_goes_on(commands, whole, mo
         patch.setattr(Evaluation, "test_step", ended)
         ran = commands.here("ended", "eval", *EVALUATION)
     signal.signal(signal.SIGINT, interrupt)  # Lightning has switched it off
-    assert (ran.status, ran.err.splitlines()[-1]) == (143, "interrupted; resume=ended goes on")
+    assert (ran.status, ran.err.splitlines()[-1]) == (143, "interrupted; resume=ended resumes it")
     ran = commands.here("ended", "eval", *EVALUATION)
     assert went_on(ran) == 2 * BATCH
     assert_the_same(ran, whole)

@@ -222,7 +222,7 @@ def test_ctrl_c_says_how_to_go_on(commands, monkeypatch):
         patch.setattr(ScoreModel, "on_train_epoch_start", interrupted)
         ran = commands.here("interrupted", "train", "trainer.max_epochs=2")
     signal.signal(signal.SIGINT, handler)  # Lightning has switched it off
-    assert (ran.status, ran.err.splitlines()[-1]) == (130, "interrupted; resume=interrupted goes on")
+    assert (ran.status, ran.err.splitlines()[-1]) == (130, "interrupted; resume=interrupted resumes it")
     assert commands.here("unused", "train", "resume=interrupted").status == 0
 
 
@@ -288,7 +288,7 @@ def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_o
     folder = commands.folder / "filled"
     assert re.fullmatch(
         r"filled/checkpoints/(best|last)\.ckpt: cannot be written \(No space left on device: it needs more than the "
-        r"[\d.]+ MB that are free\); make room, then resume=filled goes on",
+        r"[\d.]+ MB that are free\); make room, then resume=filled resumes it",
         ran.error,
     )
     assert sorted(each.name for each in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]

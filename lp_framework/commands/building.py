@@ -161,10 +161,10 @@ def resumable(folder: Path, kept: str) -> Iterator[None]:
     except (KeyboardInterrupt, SystemExit, DiskFull) as error:  # Lightning exits after an interruption
         begun = any((folder / kept).glob("*"))
         if not isinstance(error, DiskFull):
-            raise KeyboardInterrupt(f"interrupted; resume={folder} goes on" if begun else "interrupted") from error
+            raise KeyboardInterrupt(f"interrupted; resume={folder} resumes it" if begun else "interrupted") from error
         if not begun:
             raise
-        raise DiskFull(f"{error}; make room, then resume={folder} goes on") from error
+        raise DiskFull(f"{error}; make room, then resume={folder} resumes it") from error
 
 
 def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[str, ...], saved: Path) -> DictConfig:

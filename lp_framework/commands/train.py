@@ -46,8 +46,8 @@ def run(config: DictConfig) -> None:
         config = building.with_overrides(OmegaConf.create(saved_config(saved)), config, ("trainer",), saved)
     elif begun and saved_config(saved) != building.plain(config):  # never overwrite another training
         raise UserError(
-            f"{folder}: holds a training run with other settings; resume={folder} goes on with it, and this one wants "
-            "another hydra.run.dir"
+            f"{folder}: holds a training run with other settings; resume={folder} resumes it, or give another "
+            "hydra.run.dir for this one"
         )
     settings = building.plain(config)
     _check(settings)
