@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 import types
 from pathlib import Path
@@ -59,6 +60,23 @@ def test_a_card_without_an_evaluation_says_so_and_a_damaged_one_is_named(trained
     assert "license" not in card
     with pytest.raises(UserError, match=r"the model card cannot be written: .*results\.json"):
         model_card(trained / "energy", "name", None, str(tmp_path))
+
+
+def test_an_unfinished_run_is_converted_without_a_card_unless_one_is_asked_for(
+    trained: Path, lp: Any, tmp_path: Path, walker: Path
+) -> None:
+    shutil.copytree(trained / "score", tmp_path / "stopped")
+    (tmp_path / "stopped" / "training.json").unlink()
+    given = f"path={tmp_path}/stopped", f"output={tmp_path}/shared"
+    ran = lp("convert", *given, "license=mit")
+    assert ran.status == 1
+    assert "the model card cannot be written" in ran.error
+    assert not (tmp_path / "shared").exists()
+    ran = lp("convert", *given)
+    assert ran.status == 0, ran.err
+    assert "the model card cannot be written" in ran.err
+    assert {file.name for file in (tmp_path / "shared").iterdir()} >= {"model.json", "model.safetensors"}
+    assert not (tmp_path / "shared" / "README.md").exists()
 
 
 def test_a_folder_is_uploaded_under_its_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

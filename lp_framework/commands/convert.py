@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -14,11 +15,16 @@ from lp_framework.priors.zero123.networks import DTYPES
 from lp_framework.priors.zero123.weights import load_networks, write_folder
 from lp_framework.report.model_card import CARD, model_card
 
+log = logging.getLogger(__name__)
+
+OF_A_CARD = ("results", "license", "hub")  # settings for models that are shared
+
 
 def run(config: DictConfig) -> None:
     """Read `path` (with `weights` and `dtype`) and write the folder `output`, for use as `prior.path`.
 
-    If `path` is the training run of a pose model, use it as `checkpoint` instead.
+    Of the training run of a pose model, `output` is for use as `checkpoint`; it gets a model card if the run has all of
+    its records.
     """
     registry.checked(load_networks, {"weights": config.weights, "dtype": config.dtype}, "")
     output = Path(config.output)
@@ -26,18 +32,31 @@ def run(config: DictConfig) -> None:
         raise UserError(f"output={output}: exists already; give another folder or remove it")
     run_folder = Path(config.path)
     if (run_folder / FOLDER).is_dir():
-        card = model_card(run_folder, config.hub or output.name, config.license, config.results)
+        card = _card(run_folder, config)
         write_model_folder(read_checkpoint(find_checkpoint(run_folder)), run_folder, output, DTYPES[config.dtype])
-        write_text(output / CARD, card)
+        if card is not None:
+            write_text(output / CARD, card)
         print(f"converted: {output} (use it with checkpoint={output}, or prior=tiny prior.path={output})")
         if config.hub is not None:
             print(f"uploaded:  {upload(output, config.hub)}")
         return
-    for key in ("results", "license", "hub"):
+    for key in OF_A_CARD:
         if config[key] is not None:
             raise UserError(f"{key} belongs to a training run; {run_folder} is none")
     write_folder(load_networks(config.path, config.revision, config.weights, config.dtype), output)
     print(f"converted: {output} (use it with prior.path={output})")
+
+
+def _card(run_folder: Path, config: DictConfig) -> str | None:
+    """The model card; none, with a warning, of an unfinished run for which nobody asked for one."""
+    asked = any(config[key] is not None for key in OF_A_CARD)
+    try:
+        return model_card(run_folder, config.hub or Path(config.output).name, config.license, config.results)
+    except UserError as error:
+        if asked:
+            raise
+        log.warning("%s", error)
+        return None
 
 
 def upload(folder: Path, hub_id: str) -> str:
