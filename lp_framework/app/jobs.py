@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import takewhile
 from typing import Any
 
 from lp_framework.errors import UserError
@@ -104,8 +105,9 @@ class Jobs:
             return 1.0, ""
         if not job.future.running():
             with self._lock:
-                waiting = [each for each in self._jobs.values() if not each.future.done()].index(job)
-            return 0.0, f"{waiting} request{'s' if waiting > 1 else ''} before this one"
+                earlier = takewhile(lambda each: each is not job, self._jobs.values())
+                waiting = sum(not each.future.done() for each in earlier)
+            return 0.0, f"{waiting} request{'' if waiting == 1 else 's'} before this one"
         count = f" {job.done + 1} of {job.total}" if job.total else ""
         return job.share, f"{job.step}{count}" or "loading"
 

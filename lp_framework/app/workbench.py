@@ -32,6 +32,7 @@ from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs, Solver
+from lp_framework.solvers.starts import Starts
 
 T = TypeVar("T")
 
@@ -55,11 +56,13 @@ class Request:
 
 @dataclass(frozen=True)
 class Scene:
-    """A pair that is explored, on a device and as arrays with its landscapes, and what was asked for."""
+    """A pair that is explored, on a device and as arrays with its landscapes, what was asked for, and the smoothing of
+    the model's landscape, None: the model's own."""
 
     pairs: Pairs
     pair: ShownPair
     request: Request
+    sigma: float | None
 
 
 class Place(NamedTuple):
@@ -88,7 +91,7 @@ class Workbench:
     ) -> tuple[Estimate, list[ShownPair]]:
         """The cameras of photographs, and the pairs of the first with each other one with their landscapes."""
         photographs = read_photographs(files, masks, remove_background=crop, crop=crop)
-        solver, starts, needs = *self._solver(request), self._needs(request)
+        solver, starts, needs = self._solver(request), self._starts(request), component_names("solver", request.solver)
         prior = self._prior(request.prior) if "prior" in needs else None
         found = estimate(photographs, crop, solver, starts, prior, self.first, self.device, self.seed)
         shown = [
@@ -112,11 +115,12 @@ class Workbench:
         self.data.prepare_data()
         pairs, shown = named_pairs(self.data, [name], [(reference, query)], self.device)
         prior, model = self._prior(request.prior), self._model(request.checkpoint)
-        solver, starts = self._solver(request)
+        solver, starts = self._solver(request), self._starts(request)
+        sigma = sigma_of(solver)
         shown = with_prior_energy(pairs, shown, prior, self.draws)
-        shown = with_model_landscape(pairs, shown, model, sigma_of(solver))
+        shown = with_model_landscape(pairs, shown, model, sigma)
         (pair,) = solved_pairs(pairs, shown, solver, starts.make(pairs, self.seed), self.seed)
-        return Scene(pairs, pair.arrived(), request)
+        return Scene(pairs, pair.arrived(), request, sigma)
 
     @torch.no_grad()
     def place(self, scene: Scene, pose: Sequence[float], solvers: Sequence[str]) -> Place:
@@ -126,7 +130,7 @@ class Workbench:
         prior, model = self._prior(scene.request.prior), self._model(scene.request.checkpoint)
         code = prior.encode(pairs.images[pairs.reference])
         (view,) = generated_views(prior, code, here[0].cpu(), *SAMPLING, self.seed)
-        score, energy = model_field(model, pairs, here[0, :, 2], grid, sigma_of(self._solver(scene.request)[0]))
+        score, energy = model_field(model, pairs, here[0, :, 2], grid, scene.sigma)
         values = pose_energies(prior, pairs, here, self.draws), score.norm(dim=-1) if energy is None else energy
         energies = {name: value.item() for name, value in zip(scene.pair.landscapes, values, strict=True)}
         ways, refusals = {}, {}
@@ -134,7 +138,7 @@ class Workbench:
             try:
                 own = scene.request.solver
                 choice = own if solver == own.name else Choice(solver)
-                chosen, _ = self._solver(replace(scene.request, solver=choice))
+                chosen = self._solver(replace(scene.request, solver=choice))
                 (ways[solver],) = solved_pairs(pairs, [scene.pair], chosen, here, self.seed)
             except Cancelled:
                 raise
@@ -142,21 +146,22 @@ class Workbench:
                 refusals[solver] = str(error)
         return Place(pose, view, energies, ways, refusals)
 
-    def _needs(self, request: Request) -> list[str]:
-        """The components of the solver."""
-        return component_names("solver", request.solver)
-
-    def _solver(self, request: Request) -> tuple[Solver, Any]:
-        needs = {*self._needs(request), *component_names("start", request.start)}
-        parts: dict[str, Any] = {
-            "model": self._model(request.checkpoint) if "model" in needs else None,
-            "prior": self._prior(request.prior) if "prior" in needs else None,
-        }
-        solver = load_solver(request.solver.name, **parts, **request.solver.settings)
-        starts = make_starts(request.start.name, **parts, **request.start.settings)
+    def _solver(self, request: Request) -> Solver:
+        solver = load_solver(request.solver.name, **self._components("solver", request.solver, request))
         move(solver, self.device)
+        return solver
+
+    def _starts(self, request: Request) -> Starts:
+        starts = make_starts(request.start.name, **self._components("start", request.start, request))
         move(starts, self.device)
-        return solver, starts
+        return starts
+
+    def _components(self, group: str, choice: Choice, request: Request) -> dict[str, Any]:
+        """The arguments of a choice: its settings, and the model and the prior where it asks for them."""
+        needs = component_names(group, choice)
+        model = self._model(request.checkpoint) if "model" in needs else None
+        prior = self._prior(request.prior) if "prior" in needs else None
+        return {"model": model, "prior": prior, **choice.settings}
 
     def _model(self, checkpoint: str) -> PoseModel:
         return self._kept("model", checkpoint, lambda: load_model(checkpoint).to(self.device))
