@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.analysis.confidence import Answer, answers, answers_by_prior
-from lp_framework.analysis.pairs import ShownPair, View, recording, with_solution
+from lp_framework.analysis.pairs import ShownPair, photographed_pairs, recording, with_solution
 from lp_framework.api import move, view_set
 from lp_framework.data.photographs import Photograph, Prepared, on_white
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES
@@ -75,13 +75,8 @@ def estimate(
     absolute = apply_relative_pose(first, relative)
     degrees = solver.field_of_view_degrees or FIELD_OF_VIEW_DEGREES
     energies, valid = solution.energies[0].detach().cpu().double(), bool(solution.valid[0])
-    views = [
-        View(Path(each.name), on_white(image), pose)
-        for each, image, pose in zip(photographs, images, absolute.numpy(), strict=True)
-    ]
-    shown = [
-        ShownPair(f"{views[0].file.name} and {view.file.name}", "unlabelled", "", views[0], view) for view in views[1:]
-    ]
+    files = [Path(each.name) for each in photographs]
+    shown = photographed_pairs(files, [on_white(image) for image in images], absolute.numpy())
     if solution.pairs is not None:
         shown = [with_solution(pair, solution.pairs, initial, place) for place, pair in enumerate(shown)]
     return Estimate(

@@ -147,6 +147,13 @@ def shown_pairs(data: PairData, views: NDArray[np.int64], device: torch.device) 
     return pairs_of(batch, device), shown
 
 
+def photographed_pairs(files: Sequence[Path], images: Sequence[NDArray], poses: NDArray) -> list[ShownPair]:
+    """The pairs of the first of I photographs with each other one, from prepared images `[H, W, 3]` (uint8) and view
+    poses `[I, 3]`, in the order of the files."""
+    first, *others = (View(*each) for each in zip(files, images, poses, strict=True))
+    return [ShownPair(f"{first.file.name} and {other.file.name}", "unlabelled", "", first, other) for other in others]
+
+
 def named_pairs(
     data: PairDataModule, objects: Sequence[str], places: Sequence[tuple[int, int]], device: torch.device
 ) -> tuple[Pairs, list[ShownPair]]:

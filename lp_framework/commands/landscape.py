@@ -21,7 +21,7 @@ from lp_framework.analysis.ambiguity import NEAR_DEGREES, overview
 from lp_framework.analysis.examples import EXAMPLES, save_examples
 from lp_framework.analysis.fields import Draws, checked_draws
 from lp_framework.analysis.landscapes import landscape_grid
-from lp_framework.analysis.pairs import PoseMap, ShownPair, View, explained_pair, named_pairs, words
+from lp_framework.analysis.pairs import PoseMap, ShownPair, explained_pair, named_pairs, photographed_pairs, words
 from lp_framework.api import move, view_set
 from lp_framework.commands.building import Components, begin, plain, warn_of_photographs
 from lp_framework.data.photograph_files import photograph_files
@@ -128,9 +128,9 @@ def photographs(config: DictConfig, device: torch.device) -> tuple[Pairs, ShownP
     prepared = prepared_photographs(files, config.masks, config.remove_background, config.crop)
     warn_of_photographs(plain(config.prior))
     pairs = view_set(prepared, device).pairs([0], [1])
-    pose = np.array([0.0, 0.0, 1.4])
-    reference, query = (View(file, on_white(image), pose) for file, image in zip(files, prepared, strict=True))
-    return pairs, ShownPair(f"{reference.file.name} and {query.file.name}", "unlabelled", "", reference, query)
+    poses = np.tile([0.0, 0.0, 1.4], (2, 1))
+    (pair,) = photographed_pairs(files, [on_white(image) for image in prepared], poses)
+    return pairs, pair
 
 
 def landscape_arrays(pair: ShownPair, field: FieldValue | None) -> dict[str, Any]:
