@@ -27,7 +27,7 @@ from lp_framework.app.workbench import Request, Workbench
 from lp_framework.data.photographs import read_image
 from lp_framework.errors import UserError
 from lp_framework.report.estimate_files import write_estimate
-from lp_framework.report.plots import cameras_plot, map_plot, surface_plot
+from lp_framework.report.plots import cameras_plot
 
 TAB = "estimate"
 EXAMPLE_VIEWS = 3  # test views of an object that are an example, the first ones
@@ -220,10 +220,9 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
             pair = jobs.result(job).pairs[place or 0].arrived()
         except (UserError, IndexError):
             return no_update, no_update
-        if landscape not in pair.landscapes:
+        if landscape is None or landscape not in pair.landscapes:
             return no_update, no_update
-        pair = replace(pair, landscapes={landscape: pair.landscapes[landscape]})
-        return forms.for_page(map_plot(pair)), forms.for_page(surface_plot(pair))
+        return tuple(map(forms.for_page, forms.landscape_plots(pair, landscape)))
 
     @app.callback(
         Output("estimate-files", "data"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import cycle
 from typing import Any
 
@@ -18,7 +17,7 @@ from lp_framework.app import forms
 from lp_framework.app.jobs import Jobs
 from lp_framework.app.workbench import Place, Request, Scene, Workbench
 from lp_framework.errors import UserError
-from lp_framework.report.plots import add_targets, add_way, map_plot, surface_plot
+from lp_framework.report.plots import add_targets, add_way
 
 TAB = "explore"
 OWN = "two_stage_without_noise"  # the solver whose ways a landscape is shown with
@@ -200,8 +199,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, views: Mapping[str, int]) 
 def figures(scene: Scene, landscape: str, place: Place | None) -> tuple[go.Figure, go.Figure]:
     """The map and the surface of one landscape of a scene, with the ways from a place."""
     relief = scene.pair.landscapes[landscape]
-    pair = replace(scene.pair, landscapes={landscape: relief})
-    seen, raised = map_plot(pair), surface_plot(pair)
+    seen, raised = forms.landscape_plots(scene.pair, landscape)
     for (name, way), colour in zip(place.ways.items() if place else (), cycle(COLOURS), strict=False):
         path = way.ends if way.trajectories is None else way.trajectories[0]
         add_way(seen, path, words(name), colour)

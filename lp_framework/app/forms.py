@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import plotly.graph_objects as go
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from lp_framework import catalogue
+from lp_framework.analysis.pairs import ShownPair
 from lp_framework.app.jobs import Jobs
 from lp_framework.app.workbench import Choice
 from lp_framework.errors import UserError
 from lp_framework.report.page import picture
+from lp_framework.report.plots import map_plot, surface_plot
 
 # Settings that the command line alone gives: files of the machine on which the app runs, and what the app decides.
 NOT_OFFERED = ("name", "path", "weights", "trajectory")
@@ -164,6 +167,12 @@ def for_page(figure: go.Figure) -> dict[str, Any]:
     """A figure for `plot`: without the frames that the static page plays."""
     content: dict[str, Any] = figure.update_layout(meta=None).to_plotly_json()
     return content
+
+
+def landscape_plots(pair: ShownPair, landscape: str) -> tuple[go.Figure, go.Figure]:
+    """The map and the surface of one of a pair's landscapes, by name, with the trajectories of its starts."""
+    pair = replace(pair, landscapes={landscape: pair.landscapes[landscape]})
+    return map_plot(pair), surface_plot(pair)
 
 
 def selected(tab: str) -> list[State]:

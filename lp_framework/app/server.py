@@ -19,6 +19,7 @@ from lp_framework.app.workbench import Workbench
 from lp_framework.models.checkpoints import SHIPPED, WEIGHTS
 from lp_framework.report.page import PAGE
 
+TABS = ("Estimate", "Explore", "Runs")
 MOST_RUNS = 200  # pages that are listed, the latest first
 HTML = """<!DOCTYPE html>
 <html lang="en">
@@ -53,12 +54,12 @@ def make_app(
     checkpoints = sorted(file.parent.name for file in SHIPPED.glob(f"*/{WEIGHTS}") if file.parent.name != "tiny")
 
     def page() -> html.Div:
-        tabs = {
-            "Estimate": estimate.layout(list(views), checkpoints, prior),
-            "Explore": explore.layout(views, first, checkpoints, prior),
-            "Runs": _runs(runs),
-        }
-        names = [dcc.Tab(label=name, value=name) for name in tabs]
+        parts = (
+            estimate.layout(list(views), checkpoints, prior),
+            explore.layout(views, first, checkpoints, prior),
+            _runs(runs),
+        )
+        names = [dcc.Tab(label=name, value=name) for name in TABS]
         return html.Div(
             [
                 html.Header(
@@ -67,9 +68,12 @@ def make_app(
                 dcc.Store(id="visitor", data=secrets.token_urlsafe(16)),
                 html.Main(
                     [
-                        dcc.Tabs(names, "Estimate", id="tabs", mobile_breakpoint=0),
+                        dcc.Tabs(names, TABS[0], id="tabs", mobile_breakpoint=0),
                         # All are there at all times, so that a tab is as it was when a visitor comes back to it.
-                        *(html.Div(content, id=f"tab-{name}", hidden=True) for name, content in tabs.items()),
+                        *(
+                            html.Div(content, id=f"tab-{name}", hidden=True)
+                            for name, content in zip(TABS, parts, strict=True)
+                        ),
                     ]
                 ),
             ]
@@ -77,8 +81,8 @@ def make_app(
 
     app.layout = page
     app.clientside_callback(
-        "(chosen) => window.shownTab(chosen, ['Estimate', 'Explore', 'Runs'])",
-        *(Output(f"tab-{name}", "hidden") for name in ("Estimate", "Explore", "Runs")),
+        f"(chosen) => window.shownTab(chosen, {list(TABS)})",
+        *(Output(f"tab-{name}", "hidden") for name in TABS),
         Input("tabs", "value"),
     )
     forms.register_choices(app)
