@@ -33,8 +33,8 @@ def make(root, tmp_path):
     """`make(seed=1)`: the data module of that folder, with small settings."""
 
     def build(**changes) -> PairDataModule:
-        settings = {"image_size": 16, "batch_pairs": 40, "block": 3, "validation_views": 4, "seed": 0, **changes}
-        return PairDataModule(RenderingsData(str(root)), cache=str(tmp_path / "cache"), **settings)
+        settings = {"image_size": 16, "batch_pairs": 40, "block": 3, "validation_views": 4, "seed": 0}
+        return PairDataModule(RenderingsData(str(root)), **{"cache": str(tmp_path / "cache"), **settings, **changes})
 
     return build
 
@@ -53,14 +53,18 @@ def opened(monkeypatch) -> list[Path]:
 
 
 class Means:
-    """Stands for a frozen backbone: the mean colour times a weight; counts the images it is shown, but for the first,
-    by which the data module knows it."""
+    """Stands for a frozen backbone: the mean colour times a weight. Counts the images it is shown; one of them, in each
+    `cache_features`, is the sample by which the data module recognises it."""
 
     def __init__(self, weight: float = 1.0) -> None:
-        self.weight, self.shown = weight, 0
+        self.weight, self._lengths = weight, []
+
+    @property
+    def shown(self) -> int:
+        return sum(self._lengths)
 
     def trunk(self, images: torch.Tensor) -> torch.Tensor:
-        self.shown += len(images) if len(images) > 1 else 0
+        self._lengths.append(len(images))
         return self.weight * images.mean(dim=(2, 3))
 
     def to(self, device: torch.device) -> None:
@@ -217,7 +221,7 @@ def test_features_are_computed_once_and_are_the_backbones(make):
     data = make()
     data.cache_features(extractor)
     data.prepare_data()
-    assert extractor.shown == 3 * 12
+    assert extractor.shown == 3 * 12 + 1
     plain = make()
     for split in ("train", "validation", "test"):
         pairs = data.table(split).pairs("ordered")
@@ -227,7 +231,7 @@ def test_features_are_computed_once_and_are_the_backbones(make):
     again = make(seed=3)  # the views are divided otherwise, in a run of its own
     again.cache_features(extractor)
     list(again.train_dataloader()), list(again.val_dataloader())
-    assert extractor.shown == 3 * (12 + 4)
+    assert extractor.shown == 3 * (12 + 4) + 2
 
 
 class Moving(torch.nn.Module):
@@ -279,11 +283,32 @@ def test_features_belong_to_the_weights_and_the_images(make):
         view = data.data("test")[np.array([[0, 1]])]
         expected = extractor.weight * as_images(torch.tensor(make().data("test").images[:2])).mean(dim=(2, 3))
         torch.testing.assert_close(view.features, expected, rtol=0, atol=1e-6)
-    assert first.shown == other.shown == 3 * 4
+    assert (first.shown, other.shown) == (3 * 4 + 2, 3 * 4 + 1)
     data = make(image_size=8)
     data.cache_features(first)
     data.data("test")
-    assert first.shown == 2 * 3 * 4
+    assert first.shown == 2 * 3 * 4 + 3
+
+
+def test_features_do_not_depend_on_the_number_of_threads(make, tmp_path, monkeypatch):
+    backbone = torch.nn.Conv2d(3, 8, 7, dtype=torch.float32).requires_grad_(False)
+
+    class Convolved(Means):
+        def trunk(self, images: torch.Tensor) -> torch.Tensor:
+            return backbone(images).flatten(1)
+
+    found = []
+    for threads, cores in ((1, 1), (2, 3)):
+        monkeypatch.setattr("lp_framework.data.module.cores", lambda cores=cores: cores)
+        torch.set_num_threads(threads)
+        try:
+            data = make(cache=str(tmp_path / f"cache_{cores}"))
+            data.cache_features(Convolved())
+            found.append(np.array(data.data("train").features))
+            assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(1)
+    np.testing.assert_array_equal(*found)
 
 
 class Squares(Means):

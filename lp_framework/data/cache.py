@@ -91,6 +91,11 @@ def tracked(items: Iterable[T], description: str, total: int | None = None) -> I
     return track(items, description, total, console=console, transient=True, disable=not console.is_terminal)
 
 
+def cores() -> int:
+    """The number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bool = False) -> tuple[str, np.memmap]:
     """Key of the content and array `[N, size, size, 3]` (uint8) of image files, composed over white and resized. The
     result is cached until the decoding changes. With `crop` the object is centred and scaled like a photograph's, by

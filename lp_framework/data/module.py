@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from lp_framework.data.cache import cached_array, decoded_views, tracked
+from lp_framework.data.cache import cached_array, cores, decoded_views, tracked
 from lp_framework.data.files import content_key
 from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, ViewTable, as_images, in_batches, share_out
 from lp_framework.data.photographic import decoded_renderings
@@ -250,10 +251,19 @@ def _answer(extractor: FeatureExtractor, size: int) -> list[str]:
 
 
 def _extracted(extractor: FeatureExtractor, images: NDArray, device: torch.device) -> Iterator[NDArray]:
-    count = 32 if device.type == "cpu" else 256
+    """Features `[n, ...]` of consecutive images. On a CPU, threads take one image each: faster than sharing the work
+    of each layer, and the results do not depend on the number of threads."""
+    count, workers = (1, cores()) if device.type == "cpu" else (256, 1)
     extractor.to(device)  # not in inference mode: parameters moved there can no longer be trained
-    for start in tracked(range(0, len(images), count), "computing features"):
-        with torch.inference_mode():
-            pixels = torch.tensor(images[start : start + count]).to(device)  # a copy: the cache is read-only
-            features = extractor.trunk(as_images(pixels)).cpu().numpy()
-        yield features
+
+    @torch.inference_mode()
+    def features(start: int) -> NDArray:
+        pixels = torch.tensor(images[start : start + count]).to(device)  # a copy: the cache is read-only
+        found: NDArray = extractor.trunk(as_images(pixels)).cpu().numpy()
+        return found
+
+    threads, ahead = torch.get_num_threads(), 8 * workers * count
+    with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        for start in tracked(range(0, len(images), ahead), "computing features"):
+            yield from pool.map(features, range(start, min(start + ahead, len(images)), count))
+    torch.set_num_threads(threads)  # the workers have set PyTorch's default for new threads, too

@@ -25,7 +25,7 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from lp_framework.atomic import DiskFull, written
-from lp_framework.data.cache import tracked
+from lp_framework.data.cache import cores, tracked
 from lp_framework.data.camera_files import nerf_transforms, view_cameras
 from lp_framework.data.files import differences, locked, raise_failures, read_record, written_folder
 from lp_framework.data.meshes import MeshObject, fingerprint
@@ -203,9 +203,7 @@ def render_objects(
     todo = [obj for obj in objects if check_meshes or not _is_finished(obj, Path(root) / obj.name, protocol)]
     if not todo:
         return
-    if workers is None:
-        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = min(workers, len(todo))
+    workers = min(cores() if workers is None else workers, len(todo))
     failures: dict[str, str] = {}
     with locked(Path(root), ".render.lock"):
         jobs = [(obj, obj.origin and obj.origin.record()) for obj in todo]
