@@ -296,6 +296,29 @@ def test_the_object_is_projected_onto_the_photograph_it_was_cropped_from(
         np.testing.assert_allclose(camera.matrix, truth.matrix, atol=0.01)
 
 
+@pytest.mark.parametrize("name", ["lotus_vase", "cottage", "duck", "sailboat"])
+def test_the_camera_of_a_crop_projects_any_object_onto_its_photograph(name: str):
+    """Relative to the point that the crop is centred at, which an estimate takes for the object's centre."""
+    scene = next(each for each in toy_objects() if each.name == name).load()
+    truth, photograph = photographed(scene, (15, 60), (10, 0))
+    box, points = crop_to_object(photograph, "a").box, scene.to_geometry().vertices
+    across, down = np.arctan((np.reshape(box, (2, 2)) - SIDE / 2) / truth.focal).T  # the angles of the box's edges
+    middle, half = max(
+        (np.mean(across), np.ptp(across) / 2), (np.mean(down), np.ptp(down) / 2), key=lambda each: each[1]
+    )
+    depth = -np.linalg.inv(truth.matrix)[2, 3]  # of the object's centre
+    centre = truth.matrix[:3, :3] @ [depth * math.tan(across.mean()), -depth * math.tan(down.mean()), -depth]
+    centre = centre + truth.matrix[:3, 3]
+    crop = truth._replace(
+        matrix=rigid_transform(*map(torch.from_numpy, (truth.matrix[:3, :3], truth.matrix[:3, 3] - centre))).numpy()
+    )
+    ball = depth * math.sin(half) / math.cos(middle)
+    camera = photograph_camera("a.png", pose_of(crop, FILLING * ball / 0.5), (SIDE, SIDE), box, truth.focal, DEGREES)
+    error = camera.pixels(points - centre) - truth.pixels(points)
+    assert np.ptp(truth.pixels(points), axis=0).max() > 200
+    assert np.linalg.norm(error, axis=1).max() < 0.1
+
+
 def test_an_object_that_is_no_ball_is_projected_nearly_there():
     """The middle of its picture is not quite that of the object, nor is its size a ball's."""
     scene = next(each for each in toy_objects() if each.name == "lotus_vase").load()
