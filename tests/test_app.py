@@ -26,6 +26,7 @@ from lp_framework.analysis.confidence import Answer, in_words
 from lp_framework.analysis.fields import Draws
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
 from lp_framework.analysis.pairs import PRIOR_ENERGY, ShownPair, View
+from lp_framework.api import TINY_KNOWS
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
@@ -35,7 +36,7 @@ from lp_framework.solvers.progress import steps_of
 pytest.importorskip("dash")
 
 from lp_framework.app import forms
-from lp_framework.app.estimate import own_names, second_valley, warnings_of
+from lp_framework.app.estimate import own_names, second_minimum, warnings_of
 from lp_framework.app.explore import end_of
 from lp_framework.app.jobs import Cancelled, Jobs
 from lp_framework.app.server import make_app
@@ -140,7 +141,11 @@ def test_uploads_stay_in_the_visitors_folder_and_go_with_the_app() -> None:
     one.take_photographs([("../../evil.png", b"1"), ("C:\\photos\\b.png", b"2"), ("..", b"3")])
     assert [file.name for file in one.files] == ["b.png", "evil.png", "image"]
     assert all(file.is_relative_to(one.folder) and not file.is_relative_to(other.folder) for file in one.files)
+    other.take_masks([("2.png", b"3")])
     other.take_photographs([("10.png", b"1"), ("2.png", b"2")])
+    assert other.masks is not None  # uploaded before the first photographs
+    other.take_photographs([("10.png", b"1"), ("2.png", b"2")])
+    assert other.masks is None  # of other photographs
     assert [file.name for file in other.files] == ["2.png", "10.png"]
     assert visitors["one"] is one
     text = f"{one.files[0]}: is not a readable image"
@@ -179,7 +184,7 @@ def test_only_changed_settings_are_passed_on() -> None:
     assert forms.chosen("solver", "langevin", own) == Choice("langevin", {"iterations": 20})
     assert forms.chosen("solver", "langevin", states(sigma="[1.0, 0.2]")).settings == {"sigma": [1.0, 0.2]}
     assert forms.chosen("solver", "langevin", states(alpha="1e-3")).settings == {"alpha": 0.001}
-    with pytest.raises(UserError, match=r"solver, alpha: '\[1' is no number"):
+    with pytest.raises(UserError, match=r"solver, alpha: '\[1' is not a number"):
         forms.chosen("solver", "langevin", states(alpha="[1"))
 
 
@@ -238,18 +243,18 @@ def test_a_place_of_a_scene_has_the_energies_of_its_landscapes(bench: Workbench)
     for name, landscape in scene.pair.landscapes.items():
         assert place.energies[name] == pytest.approx(float(landscape.energy[5, 7]), rel=1e-4)
     assert place.view.shape == (32, 32, 3) or place.view.ndim == 3
-    assert list(place.ways) == ["langevin", "two_stage"]
+    assert list(place.solved) == ["langevin", "two_stage"]
     assert place.refusals == {}
-    starts = place.ways["langevin"].starts
+    starts = place.solved["langevin"].starts
     assert np.allclose(starts, [pose])
 
 
 def test_a_solver_that_refuses_a_start_leaves_the_others(bench: Workbench) -> None:
     scene = bench.scene("cup", 0, 1, PAPER)
     place = bench.place(scene, [0.0, 0.0, -1.5], ["ifusion", "langevin"])
-    assert list(place.ways) == ["langevin"]
+    assert list(place.solved) == ["langevin"]
     assert "starts with relative radii between" in place.refusals["ifusion"]
-    nothing = replace(place.ways["langevin"], ends=np.full((1, 3), np.nan))
+    nothing = replace(place.solved["langevin"], ends=np.full((1, 3), np.nan))
     assert end_of(nothing) == ("no pose", "", "")
 
 
@@ -261,11 +266,20 @@ def test_an_answer_to_all_photographs_at_once_is_drawn_too(bench: Workbench, pho
         assert map_plot(pair.arrived()).data
 
 
+def test_the_bundled_prior_is_said_not_to_support_photographs(
+    bench: Workbench, photographs: list[Path], jobs: Jobs
+) -> None:
+    fast = replace(PAPER, solver=Choice("ifusion", {"steps": 1}))
+    name = jobs.submit(lambda: bench.estimate(photographs[:2], None, True, fast))
+    jobs.result(name)
+    assert any(text.startswith(TINY_KNOWS) for text in jobs.warnings(name))
+
+
 def test_one_model_is_in_memory_at_a_time(bench: Workbench) -> None:
-    one = bench._model("score")
-    assert bench._model("score") is one
-    assert bench._model("general") is not one
-    assert bench._model("score") is not one
+    one = bench.model("score")
+    assert bench.model("score") is one
+    assert bench.model("general") is not one
+    assert bench.model("score") is not one
 
 
 # ---------------------------------------------------------------- words
@@ -283,21 +297,21 @@ def relief(second: float) -> Landscape:
     return Landscape(latitude, longitude, 0.0, energy / energy.max())
 
 
-def test_a_second_valley_is_named_where_it_is_nearly_as_deep() -> None:
-    said = second_valley("energy of the prior", relief(0.02))
+def test_a_second_minimum_is_named_where_it_is_nearly_as_deep() -> None:
+    said = second_minimum("energy of the prior", relief(0.02))
     assert "120° to the left" in said
     assert "1% of its range above" in said
-    assert second_valley("energy of the prior", relief(0.6)) == ""
+    assert second_minimum("energy of the prior", relief(0.6)) == ""
 
 
-def test_the_models_own_second_answer_goes_before_valleys() -> None:
+def test_the_models_second_answer_takes_precedence_over_minima() -> None:
     view = View(Path("a.png"), np.zeros((4, 4, 3), np.uint8), np.zeros(3))
     pair = ShownPair("a and b", "unlabelled", "", view, view, landscapes={PRIOR_ENERGY: relief(0.02)})
     second = Answer(0.0, math.pi, 0.31)
     assert warnings_of(Answer(0.0, 0.0, 0.6, second), pair) == [
         "It may also be 180° round, probability 0.31 (about half a turn away: front and back look alike)."
     ]
-    assert warnings_of(Answer(0.0, 0.0, 0.99), pair) == [second_valley(PRIOR_ENERGY, relief(0.02))]
+    assert warnings_of(Answer(0.0, 0.0, 0.99), pair) == [second_minimum(PRIOR_ENERGY, relief(0.02))]
 
 
 # ---------------------------------------------------------------- in a browser
@@ -380,17 +394,17 @@ def test_two_visitors_get_their_own_answers_and_files(visit: Any, photographs: l
     one.click("#tab-Estimate .field:has(> label:text-is('Solver')) .dash-dropdown")
     one.click(".dash-dropdown-option:has-text('features')")
     one.click("#estimate-run")  # without a network there is no landscape, and least of all the one before
-    one.wait_for_selector("#estimate-landscapes", state="hidden")
+    one.wait_for_selector("#estimate-shown:not([hidden]) #estimate-landscapes[hidden]", state="attached")
     one.click("#estimate-clear")
     one.wait_for_selector("#estimate-words", state="hidden")
-    assert one.locator("#thumbnails img").count() == 0
+    one.wait_for_selector("#thumbnails:not(:has(img))", state="attached")
 
 
 @with_browser
 def test_a_wrong_file_is_answered_in_a_sentence(visit: Any, photographs: list[Path], tmp_path: Path) -> None:
     page = visit()
     page.click("#estimate-run")
-    page.wait_for_selector("#estimate-error:has-text('two photographs of one object are needed')")
+    page.wait_for_selector("#estimate-error:has-text('at least two photographs of one object')")
     (tmp_path / "notes.png").write_text("no image")
     send(page, tmp_path / "notes.png", photographs[0])
     page.wait_for_selector("#estimate-error:has-text('notes.png: is not a readable image')")
@@ -405,6 +419,27 @@ def test_a_wrong_file_is_answered_in_a_sentence(visit: Any, photographs: list[Pa
 
 
 @with_browser
+def test_an_app_that_has_ended_is_noticed(browser: Any, bench: Workbench, tmp_path: Path) -> None:
+    from werkzeug.serving import make_server
+
+    jobs, visitors = Jobs(), Visitors()
+    app = make_app(bench, jobs, visitors, "tram", {"cup": 4, "tram": 4}, tmp_path, 1)
+    server = make_server("127.0.0.1", 0, app.server, threaded=True)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    page = browser.new_page()
+    page.goto(f"http://127.0.0.1:{server.port}")
+    page.wait_for_selector("#estimate-run")
+    assert page.locator(".connection").is_hidden()
+    server.shutdown()
+    server.server_close()
+    page.click("#estimate-run")
+    page.wait_for_selector(".connection:has-text('The app does not answer')")
+    page.close()
+    jobs.close()
+    visitors.close()
+
+
+@with_browser
 def test_the_choices_are_those_that_there_are(visit: Any) -> None:
     page = visit()
     page.click("summary:has-text('Method')")
@@ -413,14 +448,15 @@ def test_the_choices_are_those_that_there_are(visit: Any) -> None:
     assert options(page, "#explore-query") == ["0", "1", "2", "3"]
     page.click("#explore-object")
     page.click(".dash-dropdown-option:has-text('vase')")
-    page.wait_for_selector("#explore-query:has-text('1')")
-    assert options(page, "#explore-query") == ["0", "1"]
+    until = time.monotonic() + 20
+    while options(page, "#explore-query") != ["0", "1"]:
+        assert time.monotonic() < until
 
 
 def options(page: Any, dropdown: str) -> list[str]:
     page.click(dropdown)
     page.wait_for_selector(".dash-dropdown-option")
-    found = [each.inner_text().strip() for each in page.locator(".dash-dropdown-option").all()]
+    found = [text.strip() for text in page.locator(".dash-dropdown-option").all_inner_texts()]
     page.keyboard.press("Escape")
     return found
 

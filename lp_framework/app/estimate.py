@@ -1,4 +1,4 @@
-"""The tab in which photographs are dropped in and their cameras come out."""
+"""The tab that estimates the cameras of photographs."""
 
 from __future__ import annotations
 
@@ -30,16 +30,18 @@ from lp_framework.report.estimate_files import write_estimate
 from lp_framework.report.plots import cameras_plot
 
 TAB = "estimate"
-EXAMPLE_VIEWS = 3  # test views of an object that are an example, the first ones
+EXAMPLE_VIEWS = 3  # an example consists of the first test views of an object
 BACKGROUNDS = {
-    "cut": "Cut the object out: by its mask, by transparency, or else automatically",
-    "white": "Take the images as they are: square, with the object on white",
+    "cut": "Cut out the object: by its mask, else by transparency, else automatically",
+    "white": "Use the images as they are: square, with the object on white",
 }
-NEARLY_AS_DEEP = 0.1  # of the landscape's range: a valley no higher than this above the deepest one is worth a warning
+NEARLY_AS_DEEP = (
+    0.1  # of the landscape's range: warn of a second minimum whose energy is at most this much above the lowest
+)
 
 
 class Result(NamedTuple):
-    """An estimate as the tab shows it: the numbers, the pairs with their landscapes, and the folder of the files."""
+    """What the tab shows of an estimate: the numbers, the pairs with their landscapes, and the folder of its files."""
 
     found: Estimate
     pairs: Sequence[ShownPair]
@@ -47,12 +49,12 @@ class Result(NamedTuple):
 
 
 def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str) -> html.Div:
-    """The tab; `objects` are ready examples."""
+    """The tab; `objects` are the ready examples."""
     drop: list[Any] = ["Drop two or more photographs of one object here, or ", html.A("choose files", href="#")]
-    masks: list[Any] = [html.A("Add masks", href="#"), " of the same names, if there are any"]
+    masks: list[Any] = [html.A("Add masks", href="#"), " (with the names of their photographs), if you have them"]
     names = [{"label": words(each), "value": each} for each in objects]
     sources = [
-        dcc.Dropdown(names, id="example", placeholder="or take a ready example"),
+        dcc.Dropdown(names, id="example", placeholder="or choose an example"),
         dcc.Upload(masks, id="masks", multiple=True, className="drop small"),
     ]
     method = [
@@ -86,7 +88,7 @@ def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str) -> ht
             html.Div(id="thumbnails", className="views"),
             forms.folded("Method", method),
             html.Button("Estimate the cameras", id="estimate-run", className="main"),
-            html.Button("Start again", id="estimate-clear", className="quiet"),
+            html.Button("Clear", id="estimate-clear", className="quiet"),
             html.P(id="estimate-error", className="error", role="alert"),
             forms.progress(TAB),
             html.Div(shown, id="estimate-shown", hidden=True),
@@ -95,7 +97,7 @@ def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str) -> ht
 
 
 def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> None:
-    """The tab's callbacks."""
+    """Register the tab's callbacks."""
     for name in ("estimate-cameras", "estimate-map", "estimate-surface"):
         forms.register_plot(app, name)
     forms.register_progress(app, jobs, TAB)
@@ -130,7 +132,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
                 visitor.take_photographs(_decoded(names, photographs))
             elif what == "masks" and masks:
                 visitor.take_masks(_decoded(mask_names, masks))
-            else:  # what a callback has emptied
+            else:  # triggered by the outputs below, which reset the inputs
                 return [no_update] * 6
             jobs.cancel(job)
             return _thumbnails(visitor), "", example if what == "example" else None, None, None, True
@@ -156,13 +158,13 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
             made = forms.choices()
             request = Request(made["solver"], made["start"], made["prior"], checkpoint)
             if len(visitor.files) < 2:
-                raise UserError("two photographs of one object are needed at least; drop them above")
+                raise UserError("at least two photographs of one object are needed; drop them above")
             files, masks, folder = list(visitor.files), visitor.masks, visitor.new_folder()
 
             def work() -> Result:
                 found, pairs = bench.estimate(files, masks, background == "cut", request)
                 write_estimate(folder, found, {})
-                # Of the photographs, which are large, the prepared ones are shown.
+                # Only the prepared images are shown; the photographs may be large.
                 return Result(replace(found, photographs=()), pairs, folder)
 
             jobs.cancel(last)
@@ -204,7 +206,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
             0,
             names,
             names[0] if names else None,
-            not names,  # of a solver without a model and a prior
+            not names,  # if the solver uses neither a model nor a prior
         )
 
     @app.callback(
@@ -239,7 +241,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
 
 
 def _decoded(names: Sequence[str], contents: Sequence[str]) -> list[tuple[str, bytes]]:
-    """The files of an upload."""
+    """Decode the files of an upload: names and contents."""
     return [(name, base64.b64decode(content.partition(",")[2])) for name, content in zip(names, contents, strict=True)]
 
 
@@ -249,20 +251,20 @@ def _thumbnails(visitor: Visitor) -> list[Any]:
         forms.image(np.asarray(read_image(file)), text) for file, text in zip(visitor.files, captions, strict=True)
     ]
     masks = [] if visitor.masks is None else sorted(file.name for file in visitor.masks.iterdir())
-    return [*shown, html.P(f"with the masks {', '.join(masks)}", className="note")] if masks else shown
+    return [*shown, html.P(f"masks: {', '.join(masks)}", className="note")] if masks else shown
 
 
 def _words(result: Result) -> list[html.Div]:
-    """Every answer in words, with what speaks against it."""
+    """The answers in words, with their verdicts and warnings."""
     found, parts = result.found, []
     for place, pair in enumerate(result.pairs):
         relative = found.relative[place + 1].tolist()
         answer = found.answers[place] if found.answers else None
-        told: list[Any] = [
+        line: list[Any] = [
             html.Strong(in_words(*relative[:2])),
             f" from {pair.reference.file.name} to {pair.query.file.name}",
         ]
-        lines = [html.P(told, className="answer")]
+        lines = [html.P(line, className="answer")]
         if answer is not None and answer.verdict:
             lines.append(html.P(f"{answer.verdict.capitalize()}: {answer.reason}.", className="note"))
         lines += [html.P(text, className="warning") for text in warnings_of(answer, pair)]
@@ -271,34 +273,34 @@ def _words(result: Result) -> list[html.Div]:
 
 
 def _notes(warnings: Sequence[str], folder: Path) -> list[html.P]:
-    """What the log was told, with the visitor's own names for files."""
+    """Logged warnings, with the visitor's file names."""
     return [html.P(own_names(text, folder.parent), className="warning") for text in warnings]
 
 
 def own_names(text: str, folder: Path) -> str:
-    """A sentence without the folder of a visitor's files and that of an upload in it."""
+    """Remove the folders of a visitor's uploads from a sentence."""
     return re.sub(rf"{re.escape(str(folder))}/\w+/", "", text)
 
 
 def warnings_of(answer: Answer | None, pair: ShownPair) -> list[str]:
-    """What else a pair may mean: the model's second answer, or a valley that is nearly as deep as the deepest."""
+    """Alternatives to a pair's answer: the model's second answer, or else second minima of nearly the lowest energy."""
     if answer is not None and answer.second_words:
         return [f"It may also be {answer.second_words}."]
-    return [text for name, landscape in pair.landscapes.items() if (text := second_valley(name, landscape))]
+    return [text for name, landscape in pair.landscapes.items() if (text := second_minimum(name, landscape))]
 
 
-def second_valley(name: str, landscape: Landscape) -> str:
-    """A sentence about a second valley that is nearly as deep as the deepest one, if there is one."""
+def second_minimum(name: str, landscape: Landscape) -> str:
+    """Describe a second minimum whose energy is nearly that of the lowest one; empty if there is none."""
     minima = landscape.minima()
     if len(minima) < 2 or minima[1].height > NEARLY_AS_DEEP:
         return ""
     other = minima[1]
     where = in_words(other.latitude, other.longitude)
-    return f"The {name} has a second valley at {where}, only {other.height:.0%} of its range above the deepest one."
+    return f"The {name} has a second minimum at {where}, only {other.height:.0%} of its range above the lowest one."
 
 
 def _archive(folder: Path) -> bytes:
-    """A folder as a ZIP file."""
+    """Pack a folder as a ZIP file."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(folder.rglob("*")):

@@ -1,4 +1,4 @@
-"""What every tab is made of: choices with their settings from `conf/`, and a request's progress."""
+"""Parts that the tabs share: choices with their settings from `conf/`, the progress of a request, images and plots."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from lp_framework.errors import UserError
 from lp_framework.report.page import picture
 from lp_framework.report.plots import map_plot, surface_plot
 
-# Settings that the command line alone gives: files of the machine on which the app runs, and what the app decides.
+# Settings that only the command line offers (files of the machine that runs the app) or that the app decides.
 NOT_OFFERED = ("name", "path", "weights", "trajectory")
 SIDE = 256  # pixels of an image
-TICK = 400  # milliseconds between two looks at a request
+TICK = 400  # milliseconds between updates of a request's progress
 
 
 def field(label: str, *content: Any) -> html.Div:
@@ -32,7 +32,7 @@ def field(label: str, *content: Any) -> html.Div:
 
 
 def choice(tab: str, group: str, label: str, value: str, names: Sequence[str]) -> html.Div:
-    """A choice of a group by name, with its settings folded in."""
+    """A dropdown of a group's choices, with the chosen one's settings collapsed."""
     key = {"tab": tab, "group": group}
     settings = html.Details([html.Summary("settings"), html.Div(id={**key, "part": "settings"})], className="settings")
     dropdown = dcc.Dropdown(list(names), value, id={**key, "part": "choice"}, clearable=False, searchable=False)
@@ -40,7 +40,7 @@ def choice(tab: str, group: str, label: str, value: str, names: Sequence[str]) -
 
 
 def settings_of(tab: str, group: str, name: str) -> list[Any]:
-    """An input for every setting of a choice, with the comment from its YAML file."""
+    """An input for each setting of a choice, with the comment from its YAML file."""
     rows: list[Any] = []
     for key, block in catalogue.read(f"{group}/{name}").settings.items():
         value, _, comment = block[-1].partition(": ")[2].partition(" # ")
@@ -49,25 +49,25 @@ def settings_of(tab: str, group: str, name: str) -> list[Any]:
         comment = comment or " ".join(line.strip("# ") for line in block[:-1])
         identity = {"tab": tab, "group": group, "setting": key}
         rows.append(field(key, dcc.Input(value.strip(), id=identity, debounce=True), html.Small(comment)))
-    return rows or [html.Small("There is nothing to set.")]
+    return rows or [html.Small("It has no settings.")]
 
 
 def chosen(group: str, name: str, states: Sequence[Mapping[str, Any]]) -> Choice:
-    """A choice with the values of its inputs that are not those of its YAML file; `UserError` for what is no value."""
+    """A choice with the inputs that differ from its YAML file; `UserError` for an invalid value."""
     own, settings = catalogue.values(group, name), {}
     for state in states:
         key, text = state["id"]["setting"], state["value"]
         try:
             read: Any = OmegaConf.to_container(OmegaConf.create(f"{key}: {text}"))
         except yaml.YAMLError as error:
-            raise UserError(f"{group}, {key}: '{text}' is no number, word or [list]") from error
+            raise UserError(f"{group}, {key}: '{text}' is not a number, word or [list]") from error
         if key in own and read[key] != own[key]:
             settings[key] = read[key]
     return Choice(name, settings)
 
 
 def progress(tab: str) -> html.Div:
-    """The bar of a tab's request with its button to cancel; hidden while nothing runs."""
+    """The progress bar and cancel button of a tab's request; hidden while nothing runs."""
     return html.Div(
         [
             html.Progress(id=f"{tab}-bar", max="1"),
@@ -84,7 +84,7 @@ def progress(tab: str) -> html.Div:
 
 
 def register_choices(app: Dash) -> None:
-    """Fill in what a choice means and its settings when another is chosen."""
+    """Update the summary and the settings when another choice is made."""
 
     @app.callback(
         Output({"tab": MATCH, "group": MATCH, "part": "settings"}, "children"),
@@ -97,8 +97,8 @@ def register_choices(app: Dash) -> None:
 
 
 def register_progress(app: Dash, jobs: Jobs, tab: str) -> None:
-    """Follow a tab's request: `TAB-job` holds its name, `TAB-done` gets it at its end."""
-    # What a tick sets off is no consequence of the request for Dash, which allows no circles.
+    """Follow a tab's request: `TAB-job` holds its name; `TAB-done` receives it when the request ends."""
+    # Dash does not allow circular callbacks; the interval breaks the circle.
     app.clientside_callback(
         "(job) => [job === null, job === null]",
         Output(f"{tab}-progress", "hidden"),
@@ -135,12 +135,12 @@ def register_progress(app: Dash, jobs: Jobs, tab: str) -> None:
 
 
 def folded(title: str, content: Sequence[Any]) -> html.Details:
-    """Parts of a form that most visitors leave as they are."""
+    """A collapsed part of a form whose defaults suit most visitors."""
     return html.Details([html.Summary(title), html.Div(content, className="form")], className="method")
 
 
 def slider(label: str, name: str, steps: tuple[float, float, float], marks: Mapping[float, str]) -> html.Div:
-    """A slider from a first to a last value by steps, 0 at first."""
+    """A slider with `steps` (minimum, maximum, step), initially 0."""
     named = {value: text.replace("-", "\N{MINUS SIGN}") for value, text in marks.items()}
     return field(label, dcc.Slider(*steps, value=0, marks=named, id=name))
 
@@ -151,20 +151,20 @@ def image(pixels: NDArray, caption: str) -> html.Figure:
 
 
 def plot(name: str, height: int) -> html.Figure:
-    """A plot that is filled by the output `NAME-figure`, in the colours of the page."""
+    """A plot of the figure in the store `NAME-figure`, in the page's colours; see `register_plot`."""
     graph = dcc.Graph(id=name, config={"displaylogo": False, "displayModeBar": False}, style={"height": f"{height}px"})
     return html.Figure([dcc.Store(id=f"{name}-figure"), graph])
 
 
 def register_plot(app: Dash, name: str) -> None:
-    """Draw `NAME-figure` with the values of the page's CSS variables."""
+    """Draw `NAME-figure` with the page's CSS variables resolved."""
     app.clientside_callback(
         "(figure) => window.inPageColours(figure)", Output(name, "figure"), Input(f"{name}-figure", "data")
     )
 
 
 def for_page(figure: go.Figure) -> dict[str, Any]:
-    """A figure for `plot`: without the frames that the static page plays."""
+    """A figure as JSON for `plot`, without the animation of the static page."""
     content: dict[str, Any] = figure.update_layout(meta=None).to_plotly_json()
     return content
 
@@ -176,7 +176,7 @@ def landscape_plots(pair: ShownPair, landscape: str) -> tuple[go.Figure, go.Figu
 
 
 def selected(tab: str) -> list[State]:
-    """The states by which a callback learns a tab's choices and their settings; see `choices`."""
+    """The callback states that hold a tab's choices and their settings; see `choices`."""
     return [
         State({"tab": tab, "group": ALL, "part": "choice"}, "value"),
         State({"tab": tab, "group": ALL, "setting": ALL}, "value"),
@@ -184,7 +184,7 @@ def selected(tab: str) -> list[State]:
 
 
 def choices() -> dict[str, Choice]:
-    """The choices by group of the states of `selected`, inside their callback; `UserError` as in `chosen`."""
+    """The choices by group, read from the states of `selected` inside a callback; `UserError` as in `chosen`."""
     states = [state for states in ctx.states_list if isinstance(states, list) for state in states]
     names = {state["id"]["group"]: state["value"] for state in states if "part" in state["id"]}
     settings = [state for state in states if "setting" in state["id"]]

@@ -1,4 +1,4 @@
-"""The requests of all visitors, which run one after the other: there is one set of networks in memory."""
+"""The requests of all visitors. They run one at a time because only one set of networks is in memory."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ KEPT = 256  # requests whose results can still be fetched
 
 
 class Cancelled(UserError):
-    """A visitor has cancelled the request."""
+    """The visitor cancelled the request."""
 
 
 class Job:
-    """A request: what it waits for, how far it is, and what came of it."""
+    """A request: its progress, warnings and result."""
 
     def __init__(self, work: Callable[[], Any]) -> None:
         self._work = work
@@ -34,7 +34,7 @@ class Job:
         self.future: Future[Any]
 
     def track(self, sequence: range, *, description: str) -> Iterator[int]:
-        """See `progress.Bars`; raises `Cancelled` between two steps of a request that was cancelled."""
+        """See `progress.Bars`; raises `Cancelled` before the next step if the request was cancelled."""
         self.step, self.total = description, len(sequence)
         for self.done, each in enumerate(sequence):
             if self.cancelled:
@@ -42,7 +42,7 @@ class Job:
             yield each
 
     def run(self) -> Any:
-        """The result of the request."""
+        """Run the request and return its result."""
         if self.cancelled:
             raise Cancelled("cancelled")
         noted = Noted(self.warnings)
@@ -55,12 +55,12 @@ class Job:
 
     @property
     def share(self) -> float:
-        """How much of the present step is done, in [0, 1]."""
+        """The completed fraction of the current step, in [0, 1]."""
         return self.done / self.total if self.total else 0.0
 
 
 class Noted(logging.Handler):
-    """Collects the warnings of its thread."""
+    """Collects the warnings logged by the thread that created it."""
 
     def __init__(self, warnings: list[str]) -> None:
         super().__init__(logging.WARNING)
@@ -72,15 +72,15 @@ class Noted(logging.Handler):
 
 
 class Jobs:
-    """Runs requests in turn, in one thread. A request has a name that no one else can guess."""
+    """Runs requests one at a time in one thread. Requests have unguessable names."""
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lp-app")
-        self._jobs: OrderedDict[str, Job] = OrderedDict()  # the one whose result was fetched last comes last
+        self._jobs: OrderedDict[str, Job] = OrderedDict()  # the most recently fetched one is last
         self._lock = threading.Lock()  # of the order
 
     def submit(self, work: Callable[[], Any]) -> str:
-        """Queue a request; returns its name."""
+        """Queue a request and return its name."""
         name, job = secrets.token_urlsafe(16), Job(work)
         with self._lock:
             job.future = self._thread.submit(job.run)
@@ -90,16 +90,16 @@ class Jobs:
         return name
 
     def now(self, work: Callable[[], Any]) -> Any:
-        """Wait for a short request; its result, or what it raised."""
+        """Run a short request and return its result."""
         return self.result(self.submit(work))
 
     def cancel(self, name: str | None) -> None:
-        """End a request, if there is one of that name, before its next step."""
+        """Cancel a request before its next step; does nothing if there is no request of that name."""
         if name is not None and name in self._jobs:
             self._jobs[name].cancelled = True
 
     def state(self, name: str) -> tuple[float, str]:
-        """How much of the present step of a request is done, and what a visitor reads of it."""
+        """The completed fraction of a request's current step, and a description for the visitor."""
         job = self._jobs.get(name)
         if job is None or job.future.done():
             return 1.0, ""
@@ -112,11 +112,11 @@ class Jobs:
         return job.share, f"{job.step}{count}" or "loading"
 
     def is_done(self, name: str) -> bool:
-        """Whether a request has ended in some way."""
+        """Whether a request has finished, failed or been cancelled."""
         return name not in self._jobs or self._jobs[name].future.done()
 
     def result(self, name: str) -> Any:
-        """What came of a request; raises `UserError` with a sentence for the visitor where nothing did."""
+        """Wait for a request's result; `UserError` with a sentence for the visitor if it failed."""
         if name not in self._jobs:
             raise UserError("the app no longer has the answer to this request; please send it once more")
         try:
@@ -133,11 +133,11 @@ class Jobs:
             ) from error
 
     def warnings(self, name: str) -> list[str]:
-        """What the log was told during a request."""
+        """The warnings logged during a request."""
         return self._jobs[name].warnings
 
     def close(self) -> None:
-        """Cancel everything and wait for the end of the present step."""
+        """Cancel all requests and wait for the current step to end."""
         for job in self._jobs.values():
             job.cancelled = True
         self._thread.shutdown(cancel_futures=True)

@@ -1,4 +1,4 @@
-"""The app as a whole: its page, its tabs and the server behind them."""
+"""The app: its page, its tabs and its server."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from lp_framework.models.checkpoints import SHIPPED, WEIGHTS
 from lp_framework.report.page import PAGE
 
 TABS = ("Estimate", "Explore", "Runs")
-MOST_RUNS = 200  # pages that are listed, the latest first
+UNREACHABLE = "The app does not answer. If it has ended, start it again and reload this page."
+MOST_RUNS = 200  # pages listed, newest first
 HTML = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -44,12 +45,12 @@ HTML = """<!DOCTYPE html>
 def make_app(
     bench: Workbench, jobs: Jobs, visitors: Visitors, first: str, views: Mapping[str, int], runs: Path, megabytes: float
 ) -> Dash:
-    """The app; `views` are the numbers of test views by object, of which `first` is shown first, `runs` is the folder
-    whose pages are shown, `megabytes` the most that one visitor may send at once."""
+    """Make the app. `views` are the numbers of test views by object, `first` is the object shown first, `runs` is the
+    folder of finished runs, `megabytes` the limit of one upload."""
     app = Dash("lp_framework", title="lp_framework", update_title="", assets_folder="")
     style = _text("report/templates/page.css") + _text("app/app.css")
     app.index_string = HTML.format(style=style, script=_text("app/app.js"))
-    app.server.config["MAX_CONTENT_LENGTH"] = int(megabytes * 2**20 * 1.4)  # in letters of base64
+    app.server.config["MAX_CONTENT_LENGTH"] = int(megabytes * 2**20 * 1.4)  # base64 takes more
     prior = bench.own_prior.name
     checkpoints = sorted(file.parent.name for file in SHIPPED.glob(f"*/{WEIGHTS}") if file.parent.name != "tiny")
 
@@ -68,8 +69,9 @@ def make_app(
                 dcc.Store(id="visitor", data=secrets.token_urlsafe(16)),
                 html.Main(
                     [
+                        html.P(UNREACHABLE, className="error connection", role="alert"),
                         dcc.Tabs(names, TABS[0], id="tabs", mobile_breakpoint=0),
-                        # All are there at all times, so that a tab is as it was when a visitor comes back to it.
+                        # Hidden tabs stay in the page, so that they keep their state.
                         *(
                             html.Div(content, id=f"tab-{name}", hidden=True)
                             for name, content in zip(TABS, parts, strict=True)
@@ -91,8 +93,8 @@ def make_app(
 
     @app.server.errorhandler(413)
     def too_large(_: Exception) -> dict[str, Any]:
-        """The answer to an upload, as Dash has answers, in place of that of its callback."""
-        sentence = f"these files are larger than {megabytes:g} MB together; send fewer or smaller ones"
+        """Answer an upload in Dash's format, in place of the callback."""
+        sentence = f"these files are larger than {megabytes:g} MB together; upload fewer or smaller ones"
         emptied = {part: {"contents": None} for part in ("photographs", "masks")}
         return {"multi": True, "response": {"estimate-error": {"children": sentence}, **emptied}}
 
@@ -104,7 +106,7 @@ def make_app(
 
 
 def _runs(folder: Path) -> html.Div:
-    """Links to the pages of finished runs, the latest first."""
+    """Links to the pages of finished runs, newest first."""
     pages = sorted(folder.rglob(PAGE), key=lambda file: file.stat().st_mtime, reverse=True)[:MOST_RUNS]
     links = [
         html.Li(html.A(str(page.parent), href=f"/runs/{quote(page.relative_to(folder).as_posix())}", target="_blank"))

@@ -1,4 +1,4 @@
-"""The files of visitors: below one temporary folder, which goes with the app."""
+"""The files of visitors, in one temporary folder that is removed when the app ends."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from tempfile import TemporaryDirectory
 
 from lp_framework.data.photograph_files import as_counted
 
-KEPT_SECONDS = 3600.0  # after a visitor's last request
+KEPT_SECONDS = 3600.0  # how long files are kept after a visitor's last request
 
 
 class Visitor:
-    """One opened page: the photographs that it has sent, their masks, and the folders of its results."""
+    """An open page: the photographs it has uploaded, their masks, and the folders of its results."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.seen = folder, time.monotonic()
@@ -23,34 +23,37 @@ class Visitor:
         self.masks: Path | None = None
 
     def take_photographs(self, files: Iterable[tuple[str, bytes]]) -> None:
-        """Write photographs, names and contents, in place of those before."""
+        """Write uploaded photographs (names, contents) in place of the previous ones. Masks that were uploaded before
+        the first photographs are kept."""
+        masks = None if self.files else self.masks
         self.take_files(sorted(_written(self.new_folder(), files), key=as_counted))
+        self.masks = masks
 
     def take_files(self, files: Sequence[Path]) -> None:
-        """Take files of this machine in place of those before; masks go as well."""
+        """Use files of this machine in place of the previous photographs and masks."""
         self.files, self.masks = list(files), None
 
     def take_masks(self, files: Iterable[tuple[str, bytes]]) -> None:
-        """Write masks, names and contents, in place of those before."""
+        """Write uploaded masks (names and contents) and replace the previous ones."""
         self.masks = self.new_folder()
         _written(self.masks, files)
 
     def new_folder(self) -> Path:
-        """An empty folder."""
+        """Make an empty folder."""
         folder = self.folder / secrets.token_hex(4)
         folder.mkdir(parents=True)
         return folder
 
 
 class Visitors:
-    """All visitors, by names that nobody can guess."""
+    """All visitors, by unguessable names."""
 
     def __init__(self) -> None:
         self._folder = TemporaryDirectory(prefix="lp-app-")
         self._visitors: dict[str, Visitor] = {}
 
     def __getitem__(self, name: str) -> Visitor:
-        """A visitor by name, a new one if need be; the files of those who have left are removed."""
+        """A visitor by name, created if new. Removes the files of visitors who have left."""
         now = time.monotonic()
         for other, visitor in list(self._visitors.items()):
             if other != name and now - visitor.seen > KEPT_SECONDS:
