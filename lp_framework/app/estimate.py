@@ -51,7 +51,7 @@ class Result(NamedTuple):
 def layout(objects: Sequence[str], checkpoints: Sequence[str], prior: str) -> html.Div:
     """The tab; `objects` are the ready examples."""
     drop: list[Any] = ["Drop two or more photographs of one object here, or ", html.A("choose files", href="#")]
-    masks: list[Any] = [html.A("Add masks", href="#"), " (with the names of their photographs), if you have them"]
+    masks: list[Any] = [html.A("Add masks", href="#"), ", named like their photographs (optional)"]
     names = [{"label": words(each), "value": each} for each in objects]
     sources = [
         dcc.Dropdown(names, id="example", placeholder="or choose an example"),
