@@ -26,7 +26,7 @@ STEPS, STARTS = 20, 4
 def example(
     name: str = "red_mug", error: float = 3.0, reason: str = "worst of 4 pairs", steps: int = STEPS
 ) -> ShownPair:
-    """Four starts on straight ways to the answer, `error` degrees of longitude from the truth, over two valleys."""
+    """Four starts on straight lines to the answer, `error` degrees of longitude from the truth, in two basins."""
     latitude, longitude = landscape_grid()
     truth = np.array([0.3, 2.0, 0.1])
     away = longitude - truth[1]

@@ -258,7 +258,7 @@ def test_it_descends_in_inference_mode():
 # ---------------------------------------------------------------- choice
 
 
-def test_rescoring_compares_ends_and_not_ways():
+def test_rescoring_compares_final_poses_and_not_trajectories():
     """A long way to the right valley costs more in sum than a start that sits at the bottom of a wrong one."""
     pairs, true = exact_pairs(6)
     starts = around(true, 1.4, math.pi)

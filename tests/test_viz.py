@@ -132,12 +132,12 @@ def exact_map(starts: int = 3) -> PoseMap:
         path.append(path[-1] + 0.1 * kernel.score(path[-1], TRUTH))
     (arrows,) = model_arrows(ExactModel(kernel, TRUTH[None]), PAIR, torch.tensor([0.2]), 12.0)
     paths = torch.stack(path, dim=1).numpy()
-    ways = replace(pair_of([], TRUTH.numpy()), chosen=starts - 1, starts=start.numpy())
-    ways = replace(ways, trajectories=paths, ends=paths[:, -1])
-    return PoseMap("Exact score", arrows=arrows, ways=ways)
+    solved = replace(pair_of([], TRUTH.numpy()), chosen=starts - 1, starts=start.numpy())
+    solved = replace(solved, trajectories=paths, ends=paths[:, -1])
+    return PoseMap("Exact score", arrows=arrows, solved=solved)
 
 
-def test_the_page_of_a_pair_shows_arrows_ways_answer_and_truth():
+def test_the_page_of_a_pair_shows_arrows_trajectories_answer_and_truth():
     content = exact_map()
     figure = pair_figure(pair_of([], TRUTH.numpy()), [content, content], "tram (twofold)", "worst: 36°")
     maps = [axes for axes in figure.axes if axes.get_title("left") == "Exact score"]
@@ -152,9 +152,13 @@ def test_the_page_of_a_pair_shows_arrows_ways_answer_and_truth():
         np.testing.assert_allclose(quiver.V, content.arrows.score[..., 0].ravel())
         stars = [line.get_xydata() for line in axes.lines if line.get_marker() == "*" and len(line.get_xdata())]
         np.testing.assert_allclose(stars, [np.rad2deg([[5.6, 0.3]])], rtol=1e-6)
-        ways = [line for line in axes.lines if line.get_linestyle() == "-"]
-        assert len(ways) == 3 and [to_hex(line.get_color()) == ANSWER.lower() for line in ways] == [False, False, True]
-        for line in ways:
+        lines = [line for line in axes.lines if line.get_linestyle() == "-"]
+        assert len(lines) == 3 and [to_hex(line.get_color()) == ANSWER.lower() for line in lines] == [
+            False,
+            False,
+            True,
+        ]
+        for line in lines:
             assert np.nanmax(np.abs(np.diff(line.get_xdata()))) <= 180
             np.testing.assert_allclose(line.get_xydata()[-1], np.rad2deg([5.6, 0.3]), atol=0.5)
     # The first start lies on the seam and is marked on both edges.
@@ -175,10 +179,10 @@ def test_map_of_steep_views_shows_the_truth():
 
 def test_broken_model_is_drawn_too():
     content = exact_map(1)
-    assert content.arrows is not None and content.ways is not None and content.ways.trajectories is not None
+    assert content.arrows is not None and content.solved is not None and content.solved.trajectories is not None
     nowhere = content.arrows._replace(score=np.full_like(content.arrows.score, np.nan))
-    ways = replace(content.ways, chosen=0, trajectories=content.ways.trajectories * np.nan)
-    lost = PoseMap("Learned score", arrows=nowhere, ways=ways)
+    solved = replace(content.solved, chosen=0, trajectories=content.solved.trajectories * np.nan)
+    lost = PoseMap("Learned score", arrows=nowhere, solved=solved)
     pair_figure(pair_of([], TRUTH.numpy()), in_one_scale([lost, lost]), "a", "b").draw_without_rendering()
 
 
@@ -441,11 +445,11 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
         ]
         batch, truth = data[np.array([views])], torch.from_numpy(pair.truth)
         np.testing.assert_allclose(pair.truth, batch.relative_poses()[0])
-        assert learned.ways is not None and learned.ways.trajectories is not None
-        assert learned.ways.trajectories.shape == (9, 101, 3) and learned.ways.chosen is not None
+        assert learned.solved is not None and learned.solved.trajectories is not None
+        assert learned.solved.trajectories.shape == (9, 101, 3) and learned.solved.chosen is not None
         # Solved again, the pair has the evaluation's answer.
         answer = rows["answer"][(rows["pair"] == batch.pairs[0]).all(dim=1)][0].numpy()
-        np.testing.assert_allclose(learned.ways.ends[learned.ways.chosen], answer, atol=1e-4)
+        np.testing.assert_allclose(learned.solved.ends[learned.solved.chosen], answer, atol=1e-4)
         # The arrows are the model's score at the true radius.
         assert batch.pixels is not None and learned.arrows is not None and exact.arrows is not None
         features = model.encode(batch.images)
@@ -454,8 +458,8 @@ def test_maps_of_a_model_are_its_field_and_the_exact_one(kind: type[ScoreModel |
         np.testing.assert_allclose(learned.arrows.score, model.field(condition, pose).score.detach(), atol=1e-5)
         np.testing.assert_allclose(exact.arrows.score, model.kernel.score(pose, truth), atol=1e-6)
         # With the exact score every start arrives.
-        assert exact.ways is not None
-        offset = torch.from_numpy(exact.ways.ends) - truth
+        assert exact.solved is not None
+        offset = torch.from_numpy(exact.solved.ends) - truth
         offset[:, 1] = wrap_angle(offset[:, 1])
         assert offset.abs().max() < 2e-2
         assert (learned.density is not None) == (exact.density is not None) == (kind is EnergyModel)
@@ -489,7 +493,7 @@ def test_solver_without_model_has_one_map_without_arrows(data: PairData):
     evaluation = evaluated(Guess(), data, Ring(4))
     pair = gather_examples(evaluation, data)[0]
     (content,) = pair.maps
-    assert content.arrows is None and content.ways is not None and content.ways.trajectories is None
+    assert content.arrows is None and content.solved is not None and content.solved.trajectories is None
     figure = pair_figure(pair, pair.maps, "a", "b")
     assert len(figure.axes) == 3  # two images, one map, no colour bar
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["true pose", "answer"]

@@ -26,19 +26,19 @@ TRUTH = np.radians([10.0, 50.0, 0.0])
 IMAGE = np.full((16, 16, 3), 200, dtype=np.uint8)
 
 
-def way(*places: tuple[float, float]) -> NDArray:
+def path(*places: tuple[float, float]) -> NDArray:
     """A trajectory `[S, 3]` through latitudes and longitudes in degrees."""
     return np.radians([(north, east, 0.0) for north, east in places])
 
 
-WAYS = np.stack(
-    [way((0, 0), (5, -20), (8, 5), (10, 50)), way((0, 90), (5, 70), (9, 55), (10, 50)),
-     way((0, 180), (-10, 200), (-18, 225), (-20, 230)), way((0, 270), (-10, 260), (-18, 235), (-20, 230))]
+PATHS = np.stack(
+    [path((0, 0), (5, -20), (8, 5), (10, 50)), path((0, 90), (5, 70), (9, 55), (10, 50)),
+     path((0, 180), (-10, 200), (-18, 225), (-20, 230)), path((0, 270), (-10, 260), (-18, 235), (-20, 230))]
 )  # fmt: skip
 
 
-def took(paths: NDArray, chosen: int | None = None, landscape: Landscape = LANDSCAPE) -> ShownPair:
-    """A pair in which a solver went along paths `[N, S, 3]`, each ending a degree further off."""
+def solved_pair(paths: NDArray, chosen: int | None = None, landscape: Landscape = LANDSCAPE) -> ShownPair:
+    """A pair in which a solver took the paths `[N, S, 3]`, each ending a degree further off."""
     view, numbers = View(Path("000.png"), IMAGE, TRUTH), np.arange(len(paths), dtype=float)
     return ShownPair(
         "duck", "unique", "", view, view, TRUTH, paths[:, 0], paths, paths[:, -1], 0 * numbers, chosen, numbers,
@@ -48,12 +48,12 @@ def took(paths: NDArray, chosen: int | None = None, landscape: Landscape = LANDS
 
 def page(pair: ShownPair, title: str = "", views: list[NDArray] | None = None) -> Figure:
     """The page of a pair with one map."""
-    content = PoseMap("tiny", relief=pair.prior_energy, ways=pair)
+    content = PoseMap("tiny", relief=pair.prior_energy, solved=pair)
     return pair_figure(pair, [content], title, "note", views or [])
 
 
 def lines(axes) -> list[NDArray]:
-    """The ways that are drawn, `[points, 2]`: longitude and latitude in degrees, NaN where a line breaks."""
+    """The trajectories that are drawn, `[points, 2]`: longitude and latitude in degrees, NaN where a line breaks."""
     return [np.array(line.get_data(), dtype=float).T for line in axes.lines if line.get_linestyle() != "None"]
 
 
@@ -65,10 +65,10 @@ def marks(axes, marker: str) -> list[tuple[float, float]]:
 # ---------------------------------------------------------------- the map
 
 
-def test_a_way_across_the_seam_draws_no_line_across_the_map():
+def test_a_trajectory_across_the_seam_draws_no_line_across_the_map():
     axes = Figure().add_subplot()
-    ways = np.stack([way((0, 340), (5, 355), (10, 370), (15, 410)), way((0, 20), (0, -20), (0, -200), (0, -380))])
-    draw_map(axes, PoseMap(relief=LANDSCAPE, ways=took(ways)))
+    paths = np.stack([path((0, 340), (5, 355), (10, 370), (15, 410)), path((0, 20), (0, -20), (0, -200), (0, -380))])
+    draw_map(axes, PoseMap(relief=LANDSCAPE, solved=solved_pair(paths)))
     first, second = lines(axes)
     assert np.nanmax(np.abs(np.diff(first[:, 0]))) <= 180 and np.nanmin(first) >= -60 and np.nanmax(first) <= 360
     assert np.isnan(first[:, 0]).sum() == 1 and np.isnan(second[:, 0]).sum() == 2
@@ -78,7 +78,7 @@ def test_a_way_across_the_seam_draws_no_line_across_the_map():
 
 def test_the_map_shows_minima_truth_starts_ends_and_the_answer():
     axes = Figure().add_subplot()
-    draw_map(axes, PoseMap("duck", relief=LANDSCAPE, ways=took(WAYS, 1)), TRUTH)
+    draw_map(axes, PoseMap("duck", relief=LANDSCAPE, solved=solved_pair(PATHS, 1)), TRUTH)
     assert marks(axes, "*") == [pytest.approx((50, 10))]
     assert marks(axes, "D") == [pytest.approx((50, 10))]
     found = sorted(marks(axes, "+"))
@@ -101,7 +101,9 @@ def test_without_trajectories_and_truth_there_is_only_the_landscape():
 
 def test_ends_alone_are_no_starts():
     axes = Figure().add_subplot()
-    draw_map(axes, PoseMap(relief=LANDSCAPE, ways=replace(took(WAYS, 0), starts=None, trajectories=None)), TRUTH)
+    draw_map(
+        axes, PoseMap(relief=LANDSCAPE, solved=replace(solved_pair(PATHS, 0), starts=None, trajectories=None)), TRUTH
+    )
     assert {round(longitude) for longitude, _ in marks(axes, "o")} == {50, 230} and not lines(axes)
 
 
@@ -114,7 +116,7 @@ def test_360_degrees_is_0_again():
 
 def test_a_plain_is_drawn_as_well():
     plain = of([[1.0] * 6] * 4)
-    for figure in (page(took(WAYS, 0, plain)), surface_figure(plain)):
+    for figure in (page(solved_pair(PATHS, 0, plain)), surface_figure(plain)):
         figure.draw_without_rendering()
 
 
@@ -134,9 +136,9 @@ def test_the_map_says_the_same_in_grey():
 def test_a_page_of_a_pair_has_all_in_its_place(count):
     views = [IMAGE] * count
     captions = [f"{90 * number % 360}\u00b0: {number}\u00b0 off" for number in range(count)]
-    ways = np.repeat(WAYS[:1], count, axis=0)
-    ways[:, 0, 1] = np.radians(90 * np.arange(count))
-    figure = page(took(ways, 0 if count else None), "duck", views)
+    paths = np.repeat(PATHS[:1], count, axis=0)
+    paths[:, 0, 1] = np.radians(90 * np.arange(count))
+    figure = page(solved_pair(paths, 0 if count else None), "duck", views)
     figure.draw_without_rendering()
     titles = [axes.get_title("left") for axes in figure.axes]
     assert titles[:3] == ["reference", "query", "tiny"] and [each for each in titles if "off" in each] == captions
@@ -157,7 +159,7 @@ def test_a_page_of_a_pair_has_all_in_its_place(count):
 
 
 def test_a_long_key_stays_on_the_page():
-    figure = page(took(WAYS, 0), "tram")
+    figure = page(solved_pair(PATHS, 0), "tram")
     figure.draw_without_rendering()
     key = figure.legends[0].get_window_extent()
     assert key.x0 >= 0 and key.y0 >= 0 and key.x1 <= figure.bbox.x1
@@ -200,7 +202,7 @@ def difference(one: NDArray, other: NDArray) -> float:
 
 
 FIGURES = {
-    "landscape_page": lambda: page(took(WAYS, 1), "wells"),
+    "landscape_page": lambda: page(solved_pair(PATHS, 1), "wells"),
     "landscape_surface": lambda: surface_figure(LANDSCAPE, TRUTH, "wells"),
 }
 
@@ -215,7 +217,7 @@ def test_pictures_look_as_they_did(name):
 
 
 def test_pictures_are_written(tmp_path):
-    files = save_figure(page(took(WAYS, 1)), tmp_path / "page")
+    files = save_figure(page(solved_pair(PATHS, 1)), tmp_path / "page")
     assert [file.suffix for file in files] == [".png", ".pdf"]
     with Image.open(files[0]) as picture:
         assert picture.width > 1000 and picture.height > 400

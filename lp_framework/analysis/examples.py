@@ -84,7 +84,7 @@ def gather_examples(evaluation: Evaluation, data: PairData) -> list[ShownPair]:
     if isinstance(model, PoseModel) and not sets:
         shown = with_fields(pairs, shown, model, shown, solver if isinstance(solver, Langevin) else None, starts, seed)
     elif not sets:
-        shown = [replace(pair, maps=[PoseMap("Starts and answer", pair.landscapes.get(PRIOR_ENERGY), ways=pair)])
+        shown = [replace(pair, maps=[PoseMap("Starts and answer", pair.landscapes.get(PRIOR_ENERGY), solved=pair)])
                  for pair in shown]  # fmt: skip
     return [
         replace(pair, reason=reason, chosen=int(chosen[row]), rotation_errors=rotation[row],

@@ -107,14 +107,14 @@ class ShownPair:
 class PoseMap(NamedTuple):
     """A map of relative latitude and longitude: its title and its layers, from bottom to top.
 
-    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; a solver's trajectories as `ways`.
+    An energy as `relief`, or exp(-E) as `density`; a score as `arrows`; a solver's trajectories in `solved`.
     """
 
     title: str = ""
     relief: Landscape | None = None
     density: Landscape | None = None
     arrows: Arrows | None = None
-    ways: ShownPair | None = None
+    solved: ShownPair | None = None
 
 
 def words(name: str) -> str:
@@ -269,14 +269,14 @@ def with_fields(
         ideal = solved_pairs(pairs, shown, guided, starts, seed)
     name, radius = "exp(-E) and score" if model.has_energy else "score", truths(shown)[:, 2]
     maps = []
-    for each, title, ways in ((model, f"Learned {name}", solved), (exact, f"Exact {name} (oracle)", ideal)):
+    for each, title, results in ((model, f"Learned {name}", solved), (exact, f"Exact {name} (oracle)", ideal)):
         densities: Sequence[Landscape | None] = [None] * len(shown)
         if each.has_energy:
             densities = [
                 landscape.density() for landscape in fields.model_landscapes(each, pairs, radius, DENSITY_GRID)
             ]
         arrows = fields.model_arrows(each, pairs, radius, ARROW_SPACING)
-        parts = zip(densities, arrows, ways, strict=True)
+        parts = zip(densities, arrows, results, strict=True)
         maps.append([PoseMap(f"{title}, at the true relative radius", None, *part) for part in parts])
     return [replace(pair, maps=in_one_scale(own)) for pair, *own in zip(shown, *maps, strict=True)]
 

@@ -70,9 +70,9 @@ def run(config: DictConfig) -> None:
         found = {**summary(pair), "checkpoint": str(checkpoint) if checkpoint else None}
         table, results = pair_table(f"{pair.object}, prior={config.prior.name}", method, found), "landscape.json"
         write_arrays(folder / "landscape.npz", landscape_arrays(pair, field))
-        example = replace(pair, ambiguity="unlabelled", reason=f"the ways of {method}")
+        example = replace(pair, ambiguity="unlabelled", reason=f"trajectories of {method}")
         save_examples(folder / "pictures" / EXAMPLES, [example])
-        figures = pair_figures(pair, views, draws, f"Energy of prior {config.prior.name}, ways of {method}")
+        figures = pair_figures(pair, views, draws, f"Energy of prior {config.prior.name}, trajectories of {method}")
     write_json(folder / results, {**found, **components.record()})
     pictures = [save_figure(figure, folder / name)[0].name for name, figure in figures.items()]
     console.print(table)
@@ -100,7 +100,7 @@ def pair_figures(pair: ShownPair, views: Sequence[NDArray], draws: Draws, headin
     radius = f"{'' if pair.truth is None else 'true '}relative radius {energy.radius:+.2f}".replace("-", "\u2212")
     note = f"{minima_in_words(energy)} at the {radius}. {draws.in_words()}"
     figures = {
-        "landscape": pair_figure(pair, [PoseMap(heading, relief=energy, ways=pair)], pair.object, note, views),
+        "landscape": pair_figure(pair, [PoseMap(heading, relief=energy, solved=pair)], pair.object, note, views),
         "surface": surface_figure(energy, pair.truth, pair.object),
     }
     if pair.maps:

@@ -72,8 +72,8 @@ def draw_map(axes: Axes, content: PoseMap, truth: NDArray | None = None, limit: 
             pivot="mid", units="inches", width=0.0125, headwidth=4, headlength=4.5, headaxislength=4,
             minlength=0.5, zorder=1,
         )  # fmt: skip
-    if content.ways is not None:
-        _draw_ways(axes, content.ways, max(-low, high))
+    if content.solved is not None:
+        _draw_trajectories(axes, content.solved, max(-low, high))
     if truth is not None:
         _points(axes, truth[None], max(-low, high), **TRUTH_MARK, zorder=7)
     axes.set(xlim=(0, 360), ylim=(low, high))
@@ -91,19 +91,19 @@ def _draw_ground(
     return axes.pcolormesh(*place, cmap=colours, norm=norm, shading="gouraud", zorder=0)
 
 
-def _draw_ways(axes: Axes, ways: ShownPair, limit: float) -> None:
-    for number, path in enumerate(() if ways.trajectories is None else np.rad2deg(ways.trajectories)):
+def _draw_trajectories(axes: Axes, solved: ShownPair, limit: float) -> None:
+    for number, path in enumerate(() if solved.trajectories is None else np.rad2deg(solved.trajectories)):
         latitude, longitude = broken_at_seam(path[:, 0], path[:, 1])
-        answer = number == ways.chosen
+        answer = number == solved.chosen
         width, colour = (1.5, style.ANSWER) if answer else (0.8, style.OTHERS)
         halo = [withStroke(linewidth=width + 1.0, foreground="white")]
         look: dict[str, Any] = {"color": colour, "linewidth": width, "path_effects": halo, "zorder": 3 + answer}
         axes.plot(longitude, latitude, solid_joinstyle="round", **look)
-    if ways.starts is not None:
-        _points(axes, ways.starts, limit, **START_MARK, zorder=5)
-    _points(axes, ways.ends, limit, **END_MARK, zorder=5)
-    if ways.chosen is not None:
-        _points(axes, ways.ends[[ways.chosen]], limit, **CHOSEN_MARK, zorder=8)
+    if solved.starts is not None:
+        _points(axes, solved.starts, limit, **START_MARK, zorder=5)
+    _points(axes, solved.ends, limit, **END_MARK, zorder=5)
+    if solved.chosen is not None:
+        _points(axes, solved.ends[[solved.chosen]], limit, **CHOSEN_MARK, zorder=8)
 
 
 def _points(axes: Axes, poses: NDArray, limit: float, **mark: Any) -> None:
@@ -164,12 +164,12 @@ def small_marks(axes: Axes) -> None:
 
 def keys(maps: Sequence[PoseMap], truth: NDArray | None) -> list[Line2D]:
     """Legend entries for what is drawn."""
-    ways = [each.ways for each in maps if each.ways is not None]
+    solved = [each.solved for each in maps if each.solved is not None]
     entries: list[tuple[bool, str, dict[str, Any]]] = [
         (truth is not None, "true pose", TRUTH_MARK),
-        (any(each.chosen is not None for each in ways), "answer", CHOSEN_MARK),
-        (any(len(each.ends) > (each.chosen is not None) for each in ways), "end", END_MARK),
-        (any(each.starts is not None and len(each.starts) > 0 for each in ways), "start", START_MARK),
+        (any(each.chosen is not None for each in solved), "answer", CHOSEN_MARK),
+        (any(len(each.ends) > (each.chosen is not None) for each in solved), "end", END_MARK),
+        (any(each.starts is not None and len(each.starts) > 0 for each in solved), "start", START_MARK),
         (any(each.relief and marked_minima(each.relief) for each in maps), "local minimum", MINIMUM_MARK),
     ]
     return [Line2D([], [], label=label, **mark) for shown, label, mark in entries if shown]
@@ -276,7 +276,7 @@ def _limit(truth: NDArray | None, maps: Sequence[PoseMap]) -> float:
     """The landscape's greatest latitude (degrees); without one, at least 60 and enough to show truth and answers."""
     if (relief := maps[0].relief) is not None:
         return math.degrees(relief.latitude.abs().max().item())
-    solved = [each.ways for each in maps if each.ways is not None and each.ways.chosen is not None]
+    solved = [each.solved for each in maps if each.solved is not None and each.solved.chosen is not None]
     shown = [each.ends[each.chosen] for each in solved] + ([] if truth is None else [truth])
     furthest = max((abs(math.degrees(pose[0])) for pose in shown if math.isfinite(pose[0])), default=0.0)
     return min(180.0, max(60.0, 15.0 * math.ceil((furthest + 2) / 15)))
@@ -319,7 +319,7 @@ def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -
         row[0].set_ylabel(f"from {start}\n{off}", fontsize=7, rotation=0, ha="right", va="center",
                           color=style.ANSWER if answer else style.INK)  # fmt: skip
     above, below = style.stacked(right, 1, 1.1)
-    _small_map(above.subplots(), PoseMap("(d) landscape", relief=pair.prior_energy, ways=pair), pair.truth)
+    _small_map(above.subplots(), PoseMap("(d) landscape", relief=pair.prior_energy, solved=pair), pair.truth)
     small_surface(below.subplots(subplot_kw={"projection": "3d"}), pair.prior_energy, pair.truth)
     return figure
 
