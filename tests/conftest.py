@@ -31,7 +31,7 @@ for group in registry.GROUPS:  # built-ins register once, whatever a test's clea
     for package in registry.GROUPS[group]:
         importlib.import_module(package)
 ROOT = Path(__file__).parents[1]
-collect_ignore = ["pretended_device.py", "on_a_pretended_device.py"]  # they have a process of their own
+collect_ignore = ["mock_device.py", "on_mock_device.py"]  # run in a separate process
 
 
 @dataclass

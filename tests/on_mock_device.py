@@ -1,4 +1,4 @@
-"""Solvers and commands on a pretended accelerator give the numbers of the CPU. Run by `test_pretended_device.py`."""
+"""Solvers and commands give the same numbers on a mock GPU as on the CPU. Run by `test_mock_device.py`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from hydra.core.plugins import Plugins
 from lightning import Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
+from mock_device import MOCK, MockTensor, Syncs, mock_device
 from PIL import Image
-from pretended_device import FAR, FarTensor, Waits, pretended
 from solver_problems import around, exact_pairs, exact_sets
 from test_bench import FEW
 from test_figures import SMALL
@@ -35,77 +35,77 @@ from lp_framework.solvers.base import Solution, Solver
 from lp_framework.solvers.pair_energy import PairEnergy
 
 Plugins.instance()  # Hydra stores the configs of its own plugins once, as conftest.py has it
-ON_HOST = ("dust3r", "features", "vggt")  # matching and other people's packages compute in NumPy, or by themselves
-FORWARD_MODE = ("gauss_newton",)  # its derivatives do not pass through a device written in Python; see its own tests
-FEW_STEPS = {"steps": 6, "iterations": 6, "refinement_steps": 6, "exploration_steps": 3}  # a step costs much there
+ON_HOST = ("dust3r", "features", "vggt")  # matching and third-party packages compute in NumPy or on their own
+FORWARD_MODE = ("gauss_newton",)  # forward-mode AD does not support a device written in Python; see its own tests
+FEW_STEPS = {"steps": 6, "iterations": 6, "refinement_steps": 6, "exploration_steps": 3}  # steps are slow there
 PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1", "data.image_size=64")
 
 
 @pytest.fixture(autouse=True)
 def device(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Where commands run, it has no float64, as Apple's GPUs have none."""
-    with pretended(double="chosen" not in request.fixturenames):
+    """The mock device; without float64, like Apple's GPUs, in tests of commands."""
+    with mock_device(double="chosen" not in request.fixturenames):
         yield
 
 
 def short(name: str) -> Solver:
-    """A solver of few steps, on the CPU."""
+    """A solver with few steps, on the CPU."""
     settings = inspect.signature(registry.get("solver", name)).parameters
     return build(name, **{key: count for key, count in FEW_STEPS.items() if key in settings})
 
 
-def moved(batch: Any, device: torch.device = FAR) -> Any:
-    """A dataclass of tensors, on a device."""
+def moved(batch: Any, device: torch.device = MOCK) -> Any:
+    """Copy a dataclass of tensors to a device."""
     return type(batch)(*(value if value is None else value.to(device) for value in vars(batch).values()))
 
 
-# ---------------------------------------------------------------- the device itself
+# ---------------------------------------------------------------- the mock device
 
 
-def test_the_device_is_apart_from_the_cpu_as_a_gpu_is():
-    here, there = torch.ones(3), torch.ones(3, device=FAR)
-    assert there.device == FAR and type(2 * there + there.sum() * torch.tensor(2.0)) is FarTensor
+def test_mixing_with_cpu_tensors_raises_and_syncs_are_counted():
+    here, there = torch.ones(3), torch.ones(3, device=MOCK)
+    assert there.device == MOCK and type(2 * there + there.sum() * torch.tensor(2.0)) is MockTensor
     with pytest.raises(RuntimeError, match="same device"):
         here + there
     for away in (there.numpy, lambda: np.asarray(there)):
         with pytest.raises(TypeError, match="numpy"):
             away()
-    Waits.count = 0
+    Syncs.count = 0
     assert there.sum().item() == 3 and there.cpu().tolist() == [1, 1, 1]
-    torch.tensor([1.0], device=FAR)
-    here.to(FAR)
-    assert Waits.count == 4
+    torch.tensor([1.0], device=MOCK)
+    here.to(MOCK)
+    assert Syncs.count == 4
 
 
-def test_the_device_can_do_without_float64():
-    with pretended(double=False):
+def test_float64_can_be_disabled():
+    with mock_device(double=False):
         for make in (
-            lambda: torch.ones(3, dtype=torch.float64, device=FAR),
-            lambda: torch.ones(3, dtype=torch.float64).to(FAR),
-            lambda: torch.ones(3, device=FAR).double(),
-            lambda: torch.ones(3, device=FAR) * torch.ones((), dtype=torch.float64).to(FAR),
+            lambda: torch.ones(3, dtype=torch.float64, device=MOCK),
+            lambda: torch.ones(3, dtype=torch.float64).to(MOCK),
+            lambda: torch.ones(3, device=MOCK).double(),
+            lambda: torch.ones(3, device=MOCK) * torch.ones((), dtype=torch.float64).to(MOCK),
         ):
             with pytest.raises(TypeError, match=r"has no torch\.float64"):
                 make()
-        assert torch.ones(3, dtype=torch.float64).to(FAR, torch.float32).cpu().double().sum() == 3
+        assert torch.ones(3, dtype=torch.float64).to(MOCK, torch.float32).cpu().double().sum() == 3
 
 
 # ---------------------------------------------------------------- priors
 
 
 @pytest.mark.parametrize("name", ["tiny", "zero123"])
-def test_a_priors_energy_is_the_same_there_and_its_gradient_waits_for_nothing(name):
+def test_a_priors_energy_matches_the_cpu_and_its_gradient_does_not_synchronize(name):
     prior: Prior = Zero123Prior(Networks(NARROW)) if name == "zero123" else load_prior("tiny")
     pair = random_pair(torch.device("cpu"))
     energies = []
-    for device in (torch.device("cpu"), FAR):
+    for device in (torch.device("cpu"), MOCK):
         energy = PairEnergy(prior.to(device), moved(pair, device), seed=0)
         poses = torch.tensor([[[0.1, 0.2, 0.0], [-0.2, 3.0, 0.1]]]).to(device).requires_grad_()
-        Waits.count = 0
+        Syncs.count = 0
         energies.append(energy(poses, 300, energy.noise(0)[:, 0]))
         (slope,) = torch.autograd.grad(energies[-1].sum(), poses)
         energies.append(slope)
-        assert Waits.count == 0
+        assert Syncs.count == 0
     for here, there in zip(energies[:2], energies[2:], strict=True):
         torch.testing.assert_close(there.cpu(), here, rtol=1e-3, atol=1e-6)
 
@@ -114,63 +114,63 @@ def test_a_priors_energy_is_the_same_there_and_its_gradient_waits_for_nothing(na
 
 
 @pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FORWARD_MODE])
-def test_a_solver_finds_there_what_it_finds_here(name):
+def test_solvers_match_the_cpu(name):
     pairs, true = exact_pairs(3)
     starts = around(true, 0.3, -0.4, 1.0)
     here = short(name).solve(pairs, starts, seed=0)
     solver = short(name)
-    api.move(solver, FAR)
-    there: Solution = solver.solve(moved(pairs), starts.to(FAR), seed=0)
+    api.move(solver, MOCK)
+    there: Solution = solver.solve(moved(pairs), starts.to(MOCK), seed=0)
     for quantity in ("poses", "energies", "valid", "chosen"):
-        assert isinstance(getattr(there, quantity), FarTensor), quantity
+        assert isinstance(getattr(there, quantity), MockTensor), quantity
     torch.testing.assert_close(there.poses.cpu(), here.poses, rtol=0, atol=1e-3)
     assert torch.equal(there.chosen.cpu(), here.chosen)
 
 
 @pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FORWARD_MODE])
-def test_sets_of_images_too(name):
+def test_solvers_of_image_sets_match_the_cpu(name):
     sets, _ = exact_sets(2, 3)
     starts = torch.rand(2, 2, 3, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 6.0, 0.0])
     here = short(name).solve_views(sets, starts, seed=0)
     solver = short(name)
-    api.move(solver, FAR)
-    there = solver.solve_views(moved(sets), starts.to(FAR), seed=0)
+    api.move(solver, MOCK)
+    there = solver.solve_views(moved(sets), starts.to(MOCK), seed=0)
     torch.testing.assert_close(there.poses.cpu(), here.poses, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", [name for name in SOLVERS if name not in FORWARD_MODE + ON_HOST])
-def test_no_step_of_a_solver_waits_for_the_device(name):
-    """Twice the steps, the same number of waits."""
+def test_no_step_of_a_solver_synchronizes(name):
+    """The number of synchronizations does not depend on the number of steps."""
     (pairs, true), solver = exact_pairs(2), registry.get("solver", name)
-    starts = around(true, 0.3, -0.4).to(FAR)
+    starts = around(true, 0.3, -0.4).to(MOCK)
     counted = [
         key for key in ("iterations", "steps", "refinement_steps") if key in inspect.signature(solver).parameters
     ]
     assert counted
-    waits = []
+    syncs = []
     for steps in (4, 8):
         few = build(name, **dict.fromkeys(counted, steps))
-        api.move(few, FAR)
-        Waits.count = 0
+        api.move(few, MOCK)
+        Syncs.count = 0
         few.solve(moved(pairs), starts, seed=0)
-        waits.append(Waits.count)
-    assert waits[0] == waits[1]
+        syncs.append(Syncs.count)
+    assert syncs[0] == syncs[1]
 
 
 # ---------------------------------------------------------------- commands
 
 
-class FarAccelerator(CPUAccelerator):
-    """Lightning's, for one such device."""
+class MockAccelerator(CPUAccelerator):
+    """Lightning's accelerator for the mock device."""
 
     def setup_device(self, device: torch.device) -> None:
-        assert device == FAR
+        assert device == MOCK
 
 
 @pytest.fixture(scope="module")
 def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
-    """A score model and a prior that have trained a little, on the CPU."""
-    commands = Commands(tmp_path_factory.mktemp("far"))
+    """Runs of a prior, a score model and an energy model trained for one epoch on the CPU."""
+    commands = Commands(tmp_path_factory.mktemp("mock"))
     energy = ("model=energy", "data.image_size=64")
     for name, settings in (("prior", PRIOR), ("score", ("data.image_size=64",)), ("energy", energy)):
         trained = commands.here(name, "train", "trainer.max_epochs=1", *settings)
@@ -180,11 +180,11 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
 
 @pytest.fixture
 def chosen(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """Once called, commands choose the device, as they would choose a GPU."""
+    """A function that makes commands choose the mock device, as they would a GPU."""
 
     def choose() -> None:
-        monkeypatch.setattr("lp_framework.commands.building.best_device", lambda: FAR)
-        strategy = SingleDeviceStrategy(device=FAR, accelerator=FarAccelerator())
+        monkeypatch.setattr("lp_framework.commands.building.best_device", lambda: MOCK)
+        strategy = SingleDeviceStrategy(device=MOCK, accelerator=MockAccelerator())
         trainer = functools.partial(Trainer, strategy=strategy)
 
         def on_device(**settings: Any) -> Trainer:
@@ -220,11 +220,11 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
     assert {*gathered_on} == {torch.device("cpu")}  # it is float64
-    assert drawn_on == [FAR]
+    assert drawn_on == [MOCK]
 
 
 @pytest.mark.parametrize(("name", "settings"), [("score", ("data.image_size=64",)), ("prior", PRIOR)])
-def test_training_learns_the_same_weights(commands, chosen, name, settings):
+def test_training_gives_the_same_weights(commands, chosen, name, settings):
     chosen()
     there = commands.here(f"{name}_there", "train", "trainer.max_epochs=1", *settings)
     assert there.status == 0, there.err

@@ -1,5 +1,4 @@
-"""All that computes, on a device that is not the CPU: `on_a_pretended_device.py`, in a process of its own, since the
-device is PyTorch's for as long as the process lives."""
+"""Run the checks of `on_mock_device.py` in a separate process, because PyTorch cannot unregister a device."""
 
 from __future__ import annotations
 
@@ -12,15 +11,15 @@ from pathlib import Path
 import pytest
 from torch.utils import backend_registration
 
-CHECKS = Path(__file__).with_name("on_a_pretended_device.py")
+CHECKS = Path(__file__).with_name("on_mock_device.py")
 
 
 @pytest.mark.skipif(
     not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
-    reason="this PyTorch knows no devices that are written in Python",
+    reason="this PyTorch does not support devices written in Python",
 )
 def test_commands_and_solvers_run_on_another_device(tmp_path):
-    # Without conftest.py, which keeps these checks from being collected; importing the package mends torchvision.
+    # Without conftest.py, which ignores the file; `-p lp_framework` makes torchvision importable.
     options = ["--quiet", "--noconftest", "-p", "lp_framework", "-p", "no:cacheprovider", f"--basetemp={tmp_path}"]
     line = [sys.executable, "-m", "pytest", "-o", "addopts=--import-mode=importlib", *options, str(CHECKS)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
