@@ -74,8 +74,8 @@ def run(command: str, arguments: Sequence[str]) -> None:
     _store_plugin_configs(options["config_dir"])
     given = values_of(overrides)
     if options["config_name"] is None and "experiment" in given:
-        told = options["cfg"] or options["info"] or "hydra.mode" in given
-        options["multirun"] |= _is_sweep(command, given["experiment"]) and not told
+        single = options["cfg"] or options["info"] or "hydra.mode" in given
+        options["multirun"] |= _is_sweep(command, given["experiment"]) and not single
     if "resume" in given and (Path(given["resume"].strip("'\"")) / HYDRA).is_dir():
         # Resume in the run's own folder with its log; leave Hydra's record there unchanged.
         overrides += ["hydra.run.dir=${resume}", "hydra.output_subdir=null"]
@@ -269,8 +269,8 @@ def _is_sweep(command: str, experiment: str) -> bool:
     """Whether an experiment is a sweep; `UsageError` if it belongs to another command."""
     own = catalogue.experiments(command)
     if experiment not in own and catalogue.find(f"experiment/{experiment}"):
-        told = f"experiment={experiment} belongs to another command, not to {command}"
-        raise UsageError(f"{told} (known: {', '.join(own)})")
+        message = f"experiment={experiment} belongs to another command, not to {command}"
+        raise UsageError(f"{message} (known: {', '.join(own)})")
     return "/sweep" in catalogue.read(f"experiment/{experiment}").defaults
 
 
@@ -281,10 +281,10 @@ def explain(error: Exception) -> str:
         case MissingConfigException(missing_cfg_file=str(file)) if "/" in file:
             group, _, choice = file.rpartition("/")
             known = error.options or catalogue.choices(group)  # Hydra lists no options for choices made in a file
-            told = f"{group}={choice}: there is no {group} '{choice}'{among(choice, known)}"
+            message = f"{group}={choice}: there is no {group} '{choice}'{among(choice, known)}"
             if group == "hydra/launcher":
-                return f"{told}; pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]' brings some"
-            return told + ("; some plugins could not be loaded, see above" if registry.failures() else "")
+                return f"{message}; pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]' brings some"
+            return message + ("; some plugins could not be loaded, see above" if registry.failures() else "")
         case OverrideParseException():
             key, equals, value = error.override.partition("=")
             quoted = f"text with special characters as \"{key}='{value}'\", a list as {key}=[A,B]"

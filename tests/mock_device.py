@@ -131,10 +131,8 @@ def _compute(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
         return result
     if operator is aten.copy_.default:
         return args[0]
-    originals = {id(each.wrapped): each for each in on_mock}  # in-place operations return their argument
-    return tree_map(
-        lambda leaf: originals.get(id(leaf), MockTensor(leaf)) if isinstance(leaf, Tensor) else leaf, result
-    )
+    known = {id(each.wrapped): each for each in on_mock}  # in-place operations return their argument
+    return tree_map(lambda leaf: known.get(id(leaf), MockTensor(leaf)) if isinstance(leaf, Tensor) else leaf, result)
 
 
 def _unwrapped(leaf: object) -> object:

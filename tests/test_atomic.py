@@ -21,7 +21,7 @@ def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (RuntimeError("bug"), "bug"),
         (KeyboardInterrupt("stop"), "stop"),
@@ -31,12 +31,12 @@ def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
         (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), r"a\.txt: cannot be written \(Permission denied\)"),
     ],
 )  # fmt: skip
-def test_a_file_that_cannot_be_finished_stays_as_it_was(error: BaseException, told: str, tmp_path: Path):
+def test_a_file_that_cannot_be_finished_stays_as_it_was(error: BaseException, message: str, tmp_path: Path):
     file = tmp_path / "a.txt"
     file.write_text("old")
     full = isinstance(error, OSError) and error.errno != errno.EACCES
     kind = DiskFull if full else UserError if isinstance(error, OSError) else type(error)
-    with pytest.raises(kind, match=told), written(file) as partial:
+    with pytest.raises(kind, match=message), written(file) as partial:
         partial.write_text("half a")
         raise error
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"] and file.read_text() == "old"

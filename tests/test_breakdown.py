@@ -27,20 +27,20 @@ def rows(pairs, objects, rotation, chosen, probability=None):
 
 
 def test_pairs_are_counted_by_the_difference_of_their_longitudes():
-    told = breakdown(
+    details = breakdown(
         rows([[0, 1], [1, 0], [0, 2], [0, 3], [1, 3]], [0] * 5, [[10.0], [20.0], [40.0], [5.0], [math.nan]], [0] * 5),
         table(True),
     )
-    found = [(row["pairs"], row["R(R)@15"], row["R(R)@30"]) for row in told["by_longitude"]]
+    found = [(row["pairs"], row["R(R)@15"], row["R(R)@30"]) for row in details["by_longitude"]]
     assert found == [(2, 0.5, 1.0), (1, 1.0, 1.0), (2, 0.0, 0.0), (0, None, None)]  # 40, 60 (over 0), 100 degrees
-    assert told["calibration"] is None
-    assert "135-180° -/-" in lines(told)[0]
+    assert details["calibration"] is None
+    assert "135-180° -/-" in lines(details)[0]
 
 
 def test_the_best_of_the_first_starts_whichever_is_chosen():
-    told = breakdown(rows([[0, 1], [0, 2]], [0, 0], [[90.0, 10.0, 1.0], [90.0, 90.0, 12.0]], [0, 2]), table(True))
-    assert [(row["starts"], row["R(R)@15"]) for row in told["best_of"]] == [(1, 0.0), (2, 0.5)]
-    assert told["by_longitude"][0]["R(R)@15"] == 0.0  # by what was chosen
+    details = breakdown(rows([[0, 1], [0, 2]], [0, 0], [[90.0, 10.0, 1.0], [90.0, 90.0, 12.0]], [0, 2]), table(True))
+    assert [(row["starts"], row["R(R)@15"]) for row in details["best_of"]] == [(1, 0.0), (2, 0.5)]
+    assert details["by_longitude"][0]["R(R)@15"] == 0.0  # by what was chosen
 
 
 def test_objects_without_a_unique_answer_are_left_out_and_unlabelled_ones_are_not():

@@ -1,4 +1,4 @@
-"""The command line: overview, composition of configs, sweeps, and every mistake told in one sentence."""
+"""The command line: overview, composition of configs, sweeps, and a one-sentence message for every mistake."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def test_every_argument_of_the_trainer_can_be_given(lp):
     assert "did you mean 'max_epochs'" in lp("train", "trainer.max_epoch=2").error
     names = [name for name in inspect.signature(Trainer.__init__).parameters if name != "self"]
     assert {"max_steps", "min_epochs", "check_val_every_n_epoch"} <= {*names}
-    told = config_of(lp("train", *(f"trainer.{name}=null" for name in names), "--cfg", "job"))["trainer"]
-    assert {*names} <= {*told}
+    trainer = config_of(lp("train", *(f"trainer.{name}=null" for name in names), "--cfg", "job"))["trainer"]
+    assert {*names} <= {*trainer}
 
 
 @pytest.mark.parametrize("choice", ["solver=langevin,sharp", "solver.gamma=0,1"])

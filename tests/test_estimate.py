@@ -177,7 +177,7 @@ def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
 
 
 def test_cameras_open_elsewhere_with_the_crops_and_with_the_photographs(lp, photos: Path, tmp_path: Path):
-    """One is a JPEG that a telephone has turned, with its focal length; the others do not tell theirs."""
+    """One is a JPEG that a telephone has turned, with its focal length; the others have none."""
     exif = Image.Exif()
     exif[274] = 6  # turn it clockwise
     exif.get_ifd(0x8769)[41989] = 28  # mm on 35 mm film
@@ -188,10 +188,10 @@ def test_cameras_open_elsewhere_with_the_crops_and_with_the_photographs(lp, phot
     finished = estimate(lp, "images=photos", "radius=1.6")
     assert finished.status == 0, finished.err
     run = tmp_path / "run"
-    told = (
+    message = (
         "no focal length in the EXIF data of front.png, right.png: 1.2 times the longer side is assumed for original/"
     )
-    assert finished.out.count(told) == 1
+    assert finished.out.count(message) == 1
     focals = json.loads((run / "results.json").read_text())["focal_lengths"]
     film = 28 / math.hypot(36, 24) * math.hypot(300, 200)
     assert [(each["pixels"], each["known_by"]) for each in focals] == [
@@ -408,16 +408,16 @@ def test_names_mean_what_they_do_elsewhere_and_other_models_have_no_probability(
     torch.testing.assert_close(built.poses, solution.poses)
 
 
-def test_who_rests_on_the_prior_that_ships_is_told(lp, clean_registry, caplog):
-    def told(*overrides: str) -> bool:
+def test_who_rests_on_the_prior_that_ships_is_warns(lp, clean_registry, caplog):
+    def warns(*overrides: str) -> bool:
         printed = lp("estimate", "images=x", "--cfg", "job", *overrides).out
         caplog.clear()
         warn_of_prior(Components(plain(OmegaConf.create(printed))))
         return "prior=tiny, which ships, supports only the twelve embedded objects" in caplog.text
 
-    assert told("solver=two_stage") and told("solver=ifusion")
-    assert not told() and not told("solver=two_stage", "prior=zero123xl") and not told("solver=langevin")
-    assert not told("solver=ifusion", "prior.path=mine")
+    assert warns("solver=two_stage") and warns("solver=ifusion")
+    assert not warns() and not warns("solver=two_stage", "prior=zero123xl") and not warns("solver=langevin")
+    assert not warns("solver=ifusion", "prior.path=mine")
 
 
 # ---------------------------------------------------------------- what people get
@@ -517,7 +517,7 @@ def general() -> PoseModel:
 
 
 def confidence(general: PoseModel, reference: Image.Image, query: Image.Image) -> tuple[float, Answer]:
-    """The answer's longitude in degrees, and all that is told; every number is finite."""
+    """The answer's longitude in degrees, and all other output; every number is finite."""
     solution = lp_framework.estimate_pose(reference, query, model=general)
     assert solution.poses.isfinite().all() and solution.energies.isfinite().all() and solution.valid.all()
     (answer,) = answers(solution)

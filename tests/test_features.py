@@ -109,16 +109,16 @@ def with_fields_of_view(poses: Tensor, degrees: list[float]) -> Pairs:
 
 @pytest.mark.parametrize("degrees", [[25.0] * 4, [80.0] * 4, [30.0, 49.1, 70.0, 45.0]])
 def test_each_view_has_its_own_field_of_view(degrees):
-    """Which the solver takes from the pairs, unless it was told one for all."""
+    """The solver uses the fields of view of the pairs, unless a single one is set."""
     pairs = with_fields_of_view(VIEWS, degrees)
     true = VIEWS[:1].expand(3, 3), VIEWS[1:]
     rotation, translation = errors(solve(with_matches(Zoomed(size=SIZE)), pairs), *true)
     assert rotation.max() < 0.02 and translation.max() < 1e-3
     without = replace(pairs, field_of_view=None)
     assert errors(solve(with_matches(Zoomed(size=SIZE)), without), *true)[0].max() > 1
-    told = with_matches(Zoomed(size=SIZE), field_of_view_degrees=degrees[0])
-    assert (errors(solve(told, without), *true)[0].max() < 0.02) == (len({*degrees}) == 1)
-    torch.testing.assert_close(solve(told, pairs).poses, solve(told, without).poses, equal_nan=True)
+    fixed = with_matches(Zoomed(size=SIZE), field_of_view_degrees=degrees[0])
+    assert (errors(solve(fixed, without), *true)[0].max() < 0.02) == (len({*degrees}) == 1)
+    torch.testing.assert_close(solve(fixed, pairs).poses, solve(fixed, without).poses, equal_nan=True)
 
 
 def test_another_zoom_from_the_same_place_is_the_same_view():

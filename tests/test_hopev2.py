@@ -131,9 +131,9 @@ def test_metres_are_told_from_millimetres_by_the_masks(make, root, tmp_path, mod
     rewrite(root / "models" / "models_info.json", scaled(model))
     for folder in root.glob("val*/*"):
         rewrite(folder / "scene_gt.json", scaled(pose, "cam_t_m2c"))
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         make().prepare()
-    taken = [str(each.message) for each in told if "assuming" in str(each.message)]
+    taken = [str(each.message) for each in caught if "assuming" in str(each.message)]
     expected = [f"{root}: object 'obj_000001': assuming {units}, as its masks show"] if model != pose else []
     assert taken == expected
     assert json.loads((tmp_path / "views/obj_000001/conversion.json").read_text())["units"] == units

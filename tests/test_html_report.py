@@ -215,9 +215,9 @@ def test_a_prior_that_would_take_long_has_no_landscape(evaluation, monkeypatch):
 
 def test_the_solver_stays_as_it_was(evaluation):
     solver = evaluation[0].solver
-    told = recording(solver)
-    assert told.first.trajectory and told.second.trajectory
-    assert not solver.first.trajectory and not solver.second.trajectory and told.prior is solver.prior
+    recorded = recording(solver)
+    assert recorded.first.trajectory and recorded.second.trajectory
+    assert not solver.first.trajectory and not solver.second.trajectory and recorded.prior is solver.prior
 
 
 def test_other_objects_add_their_worst_pairs_those_with_a_unique_answer_first():
@@ -561,9 +561,9 @@ def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tm
 
     cards = page.locator(".card")
     assert cards.count() == 3 and cards.first.get_attribute("aria-pressed") == "true"
-    assert "off by 170.0°" in page.locator(".told:visible").inner_text()
+    assert "off by 170.0°" in page.locator(".pair-facts:visible").inner_text()
     cards.nth(2).press("Enter")
-    assert "off by 3.0°" in page.locator(".told:visible").inner_text()
+    assert "off by 3.0°" in page.locator(".pair-facts:visible").inner_text()
     assert cards.nth(2).get_attribute("aria-pressed") == "true"
     scroll_through(page)
     assert page.locator(".plot.surface.drawn").count() == 1  # the one of the first pair has been put away

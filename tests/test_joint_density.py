@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lp_framework.models.pose_density import GRID, PoseDensity
-from lp_framework.solvers.joint_density import _climbed, _drawn, joint_density
+from lp_framework.solvers.joint_density import _ascended, _sampled, joint_density
 
 TURN = 2 * math.pi
 LONGITUDES = torch.linspace(0, TURN, GRID + 1)[:-1]
@@ -64,10 +64,10 @@ def test_the_most_likely_longitudes_are_those_of_all_combinations(seed: int):
 
     turn = (torch.arange(GRID)[None] - torch.arange(GRID)[:, None]) % GRID  # of the second view to the third
     total = both(0, 1)[:, None] + both(0, 2)[None] + both(1, 2)[turn]
-    told = torch.zeros(1, 3, 3, GRID)
+    log_prob = torch.zeros(1, 3, 3, GRID)
     for a, b in itertools.permutations(range(3), 2):
-        told[0, a, b] = both(a, b)
-    climbed = _climbed(told, _drawn(told, torch.tensor([1]), seed=0))[0].tolist()
+        log_prob[0, a, b] = both(a, b)
+    climbed = _ascended(log_prob, _sampled(log_prob, torch.tensor([1]), seed=0))[0].tolist()
     assert list(divmod(int(total.argmax()), GRID)) in [places[1:] for places in climbed]
 
 

@@ -240,10 +240,10 @@ def test_the_distance_rises_up_to_the_antipode(model, sigma):
     away = torch.linspace(0, math.pi, 100, dtype=torch.float64)
     starts = true[:, None].repeat(1, 100, 1)
     starts[..., 1] += away
-    told = Langevin(model(sigma), gamma=0, iterations=0).solve(problem, starts, seed=0).energies
-    assert (told.diff(dim=1) > 0).all()
-    torch.testing.assert_close(told[:, 0], torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-6)
-    torch.testing.assert_close(told[:, -1], torch.full((2,), math.pi, dtype=torch.float64), rtol=0.05, atol=0)
+    distance = Langevin(model(sigma), gamma=0, iterations=0).solve(problem, starts, seed=0).energies
+    assert (distance.diff(dim=1) > 0).all()
+    torch.testing.assert_close(distance[:, 0], torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-6)
+    torch.testing.assert_close(distance[:, -1], torch.full((2,), math.pi, dtype=torch.float64), rtol=0.05, atol=0)
 
 
 def test_an_end_at_the_antipode_is_not_the_answer():

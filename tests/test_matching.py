@@ -28,7 +28,7 @@ def model() -> MatchingModel:
 
 
 def cells_at(azimuths: torch.Tensor) -> ViewCells:
-    """A view whose cells are points of an object, told apart by their descriptors, at these azimuths `[K]`."""
+    """A view whose cells are points of an object, distinguished by their descriptors, at these azimuths `[K]`."""
     count = len(azimuths)
     phase = azimuths[:, None] * torch.arange(HARMONICS + 1)
     return ViewCells(
@@ -94,8 +94,8 @@ def test_condition_is_indexed_as_the_pairs_are(model: MatchingModel):
     torch.testing.assert_close(model.field(density, pose[:, 2]).score, score[:, 2], rtol=1e-4, atol=1e-5)
 
 
-class TwoValleys(MatchingModel):
-    """A matching model that is told its density: 0.6 at a longitude of 100 degrees, 0.4 at 280."""
+class Bimodal(MatchingModel):
+    """A matching model with a given density: 0.6 at a longitude of 100 degrees, 0.4 at 280."""
 
     def encode(self, images):
         return images.new_zeros(len(images), 1)
@@ -110,47 +110,47 @@ class TwoValleys(MatchingModel):
 
 
 @pytest.fixture(scope="module")
-def told() -> TwoValleys:
-    return TwoValleys(EfficientNetLite0Maps(), width=32, layers=1)
+def bimodal() -> Bimodal:
+    return Bimodal(EfficientNetLite0Maps(), width=32, layers=1)
 
 
 def a_pair() -> Pairs:
     return Pairs(torch.ones(2, 3, 8, 8), torch.tensor([0]), torch.tensor([1]), torch.tensor([5]))
 
 
-def test_modes_are_starts_with_the_most_likely_first(told: TwoValleys):
-    starts = Modes(told, count=2).make(a_pair(), seed=0)
+def test_modes_are_starts_with_the_most_likely_first(bimodal: Bimodal):
+    starts = Modes(bimodal, count=2).make(a_pair(), seed=0)
     wanted = torch.tensor([[[0.2, math.radians(100), -0.1], [0.2, math.radians(280), -0.1]]])
     torch.testing.assert_close(starts, wanted, rtol=0, atol=2e-3)
 
 
-def test_descent_that_sharpens_ends_in_the_deeper_valley(told: TwoValleys):
+def test_sharpening_descent_ends_in_the_higher_mode(bimodal: Bimodal):
     starts = torch.tensor([[[0.0, math.radians(each), 0.0] for each in (130.0, 250.0, 20.0)]])
-    solution = Langevin(told, gamma=0.0, iterations=120, sigma=[1.0, 0.1]).solve(a_pair(), starts, seed=0)
+    solution = Langevin(bimodal, gamma=0.0, iterations=120, sigma=[1.0, 0.1]).solve(a_pair(), starts, seed=0)
     latitude, longitude, radius = solution.answer()[0].tolist()
     assert math.degrees(longitude) == pytest.approx(100, abs=1)
     assert (latitude, radius) == (pytest.approx(0.2, abs=0.01), pytest.approx(-0.1, abs=0.01))
 
 
-def test_each_mode_keeps_its_valley_at_little_smoothing_and_energy_chooses(told: TwoValleys):
-    solver = Langevin(told, gamma=0.0, sigma=0.15)
-    starts = Modes(told, count=2).make(a_pair(), seed=0).flip(1)  # the lesser one first
+def test_modes_stay_separate_with_little_smoothing_and_the_energy_chooses(bimodal: Bimodal):
+    solver = Langevin(bimodal, gamma=0.0, sigma=0.15)
+    starts = Modes(bimodal, count=2).make(a_pair(), seed=0).flip(1)  # the lesser one first
     solution = solver.solve(a_pair(), starts, seed=0)
     assert torch.rad2deg(solution.poses[0, :, 1]).tolist() == pytest.approx([280, 100], abs=1)
     assert solution.chosen.tolist() == [1]
 
 
-def test_ends_come_with_their_probability(told: TwoValleys):
-    starts = Modes(told, count=2).make(a_pair(), seed=0)
-    solution = Langevin(told, gamma=0.0, sigma=0.15).solve(a_pair(), starts, seed=0)
+def test_ends_come_with_their_probability(bimodal: Bimodal):
+    starts = Modes(bimodal, count=2).make(a_pair(), seed=0)
+    solution = Langevin(bimodal, gamma=0.0, sigma=0.15).solve(a_pair(), starts, seed=0)
     assert solution.probability is not None
     assert solution.probability[0].tolist() == pytest.approx([0.6, 0.4], abs=0.02)
-    density = told.condition(torch.zeros(1, 1), torch.zeros(1, 1))
-    wide = told.probability(density[:, None], solution.poses, degrees=120.0)
+    density = bimodal.condition(torch.zeros(1, 1), torch.zeros(1, 1))
+    wide = bimodal.probability(density[:, None], solution.poses, degrees=120.0)
     assert (wide > solution.probability).all() and (wide <= 1).all()
 
 
-class Undecided(TwoValleys):
+class Undecided(Bimodal):
     """Told the longitudes of views by their images; pairs that are far apart prefer half a turn more."""
 
     def encode(self, images):

@@ -1,4 +1,4 @@
-"""Photographs: read whatever they are, cut out, framed alike wherever the object stands, and every mistake told."""
+"""Photographs: reading any format, cutting out and framing the object, and messages for every mistake."""
 
 from __future__ import annotations
 
@@ -224,12 +224,12 @@ def test_stray_pixels_far_from_the_object_are_left_out(size: tuple[int, int]):
     stray[-3, -2, 3], stray[-9:-6, 5:9, 3] = 255, 255
     message = "a: its mask has 13 pixels that lie apart from the object; they are left out"
     for image, mask in ((stray, None), (stray[..., :3], stray[..., 3])):
-        with pytest.warns(UserWarning) as told:
+        with pytest.warns(UserWarning) as caught:
             mask = None if mask is None else Image.fromarray(mask)
             assert np.array_equal(prepare(Image.fromarray(image), "a", mask), expected)
-        assert message in [str(each.message) for each in told]
+        assert message in [str(each.message) for each in caught]
     separate = "a: its mask has 2 separate parts, all of which count as the object"
-    assert (size == (300, 200)) == (separate in [str(each.message) for each in told])  # in the other the gap is thin
+    assert (size == (300, 200)) == (separate in [str(each.message) for each in caught])  # in the other the gap is thin
 
 
 def test_soft_masks_keep_their_edges():
@@ -490,9 +490,9 @@ def test_masks_of_other_names_are_told_and_not_passed_over(names: tuple[str, ...
     for name in names:
         placed(drawn(), 20, 30).getchannel("A").save(tmp_path / "masks" / name)
     files = [saved(placed(drawn(), 20, 30).convert(mode), tmp_path / name) for name in ("a.png", "b.png")]
-    with pytest.raises(UserError) as told:
+    with pytest.raises(UserError) as caught:
         read_photographs(files, tmp_path / "masks", remove_background=False, crop=True)
-    assert str(told.value) == (
+    assert str(caught.value) == (
         f"{files[0]}: has no mask; looked for {tmp_path / 'masks' / 'a'}.png (or with another suffix), "
         f"found {', '.join(names) or 'nothing'}"
     )

@@ -114,8 +114,8 @@ def test_a_broken_plugin_is_named_and_the_rest_load(here, write, source, error):
     write("plugins/c/tmp_c.py", start("last"))
     assert {"taken", "last"} <= set(registry.names("start"))
     assert "fine" not in registry.names("start")  # nothing of a plugin that stops half way
-    (origin, told), = registry.failures().items()  # fmt: skip
-    assert origin == "folder plugins/b" and told.startswith(error)
+    (origin, failure), = registry.failures().items()  # fmt: skip
+    assert origin == "folder plugins/b" and failure.startswith(error)
 
 
 def test_a_plugin_whose_module_has_the_name_of_another_is_named(here, write):

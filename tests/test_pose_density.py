@@ -98,13 +98,13 @@ def test_probability_is_the_share_of_draws_whose_rotation_is_near(degrees: float
     density = some_density()
     modes = torch.stack([density.mean[:, 0], density.modes(1)[:, 0], density.mean[:, 1]], dim=-1)[:, None]
     poses = torch.cat([modes, some_poses(3) * torch.tensor([0.5, 1.0, 1.0])], dim=1)
-    told = density[:, None].probability(poses, degrees)
+    predicted = density[:, None].probability(poses, degrees)
     reference = torch.tensor([latitude, 1.0, 1.5], dtype=torch.float64)
     draws = camera_to_world(reference + drawn_poses(density, 40_000))
     error = rotation_error(draws[:, None], camera_to_world(reference + poses)[:, :, None])
     near = (error <= degrees).double().mean(dim=-1)
-    torch.testing.assert_close(told, near, rtol=0, atol=0.012)
-    assert told.shape == (3, 4) and (told.max() > 0.3 or degrees < 30)
+    torch.testing.assert_close(predicted, near, rtol=0, atol=0.012)
+    assert predicted.shape == (3, 4) and (predicted.max() > 0.3 or degrees < 30)
 
 
 def test_probability_within_any_rotation_is_one():

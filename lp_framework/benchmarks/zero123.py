@@ -161,7 +161,7 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     peaks = {count: peak_bytes(batched(ready, pair, poses, 1), batch_prior, device) for count, poses in ring.items()}
     loop_peak = peak_bytes(loops[0].step, loop_prior, device)
     for count, peak in peaks.items() if device.type == "cuda" else ():
-        section.add(f"{told(count)}, peak memory, GB", peak / 1e9, loop_peak / 1e9)
+        section.add(f"{starts_label(count)}, peak memory, GB", peak / 1e9, loop_peak / 1e9)
     section.note = (
         f"Zero123's {computing.architecture} size, random weights. {BATCHED}: all starts and both directions "
         f"together, images encoded once ({encoding:.3g} s, not counted); {LOOP}: one start at a time, images "
@@ -169,7 +169,7 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     )
     section.facts = {"encoding_seconds": encoding}
     works = {
-        f"{told(count)}, seconds per step": (
+        f"{starts_label(count)}, seconds per step": (
             batched(ready, pair, poses, steps),
             worth(steps, partial(looped, loops[:count], steps)),
         )
@@ -196,8 +196,8 @@ def measure_pair(
     def plain(count: int) -> None:
         looped([PlainLoop(loop_prior, pair.images, start) for start in ring[count][0]], steps)
 
-    ours = {count: worth(1, partial(solver.solve, pair, poses, 0)) for count, poses in ring.items()}
-    first = {count: timed(work, section.device)[0] for count, work in ours.items()}
+    runs = {count: worth(1, partial(solver.solve, pair, poses, 0)) for count, poses in ring.items()}
+    first = {count: timed(work, section.device)[0] for count, work in runs.items()}
     PlainLoop(loop_prior, pair.images, ring[starts[0]][0, 0]).step()
     section.facts["first_pair_seconds"] = first
     section.note = (
@@ -208,12 +208,13 @@ def measure_pair(
         f"{', '.join(f'{seconds} s from {count}' for count, seconds in paper_seconds.items())}"
     )
     works = {
-        f"{told(count)}, seconds per pair": (work, worth(1, partial(plain, count))) for count, work in ours.items()
+        f"{starts_label(count)}, seconds per pair": (work, worth(1, partial(plain, count)))
+        for count, work in runs.items()
     }
     section.race(works, rounds, warm_up=False)
 
 
-def told(starts: int) -> str:
+def starts_label(starts: int) -> str:
     """The number of starts in words."""
     return f"{starts} start{'s' if starts > 1 else ''}"
 
@@ -249,17 +250,17 @@ def measure_precision(
     section.note = f"Zero123's {architecture} size, random weights, {starts} starts"
     for words, computing in computings.items():
         other = computing.prior(networks)
-        theirs = encoded(other, codes)
+        variant_ready = encoded(other, codes)
         # Measured at the first step: once recorded, later steps allocate nothing.
-        its_memory = peak_bytes(partial(gradient, theirs, pair, poses), other.unet, device)
-        off = ((gradient(theirs, pair, poses) - exact).abs().max() / exact.abs().max()).item()
+        variant_memory = peak_bytes(partial(gradient, variant_ready, pair, poses), other.unet, device)
+        off = ((gradient(variant_ready, pair, poses) - exact).abs().max() / exact.abs().max()).item()
         section.note += f"; {words}: gradient off by {off:.1g}"
         section.facts[words] = {"gradient_deviation": off}
         label = f"{words}: seconds per step"
-        section.race({label: (batched(theirs, pair, poses, steps), batched(ready, pair, poses, steps))}, rounds)
+        section.race({label: (batched(variant_ready, pair, poses, steps), batched(ready, pair, poses, steps))}, rounds)
         if device.type == "cuda":
-            section.add(f"{words}: peak memory, GB", its_memory / 1e9, memory / 1e9)
-        del other, theirs
+            section.add(f"{words}: peak memory, GB", variant_memory / 1e9, memory / 1e9)
+        del other, variant_ready
 
 
 def gradient(prior: Prior, pair: Pairs, poses: Tensor) -> Tensor:

@@ -161,9 +161,9 @@ def print_results(folder: Path, result: dict[str, Any], pictures: Sequence[Path]
     for table in terminal_tables(title, summary_rows(result), console.width):
         console.print(table)
     console.print(f"seconds per pair {result['seconds_per_pair']:.4f}")
-    told = result["breakdown"]
-    if told and told["calibration"]:  # of a model with probabilities
-        for line in lines(told):
+    details = result["breakdown"]
+    if details and details["calibration"]:  # of a model with probabilities
+        for line in lines(details):
             console.print(line, soft_wrap=True)
     if result["unanswered"]:
         console.print(f"no answer for {result['unanswered']:.1%} of the pairs")

@@ -204,8 +204,8 @@ def raise_failures(failures: Mapping[str, str], objects: int, done: str) -> None
         others = sum(len(of_these) for of_these in [*names.values()][SHOWN:])
         lines = [*lines[:SHOWN], f"and {others} more"]
     if lines:
-        told = f" {lines[0]}" if len(lines) == 1 else "".join(f"\n  {line}" for line in lines)
-        raise UserError(f"{len(failures)} of {objects} objects could not be {done}:{told}")
+        details = f" {lines[0]}" if len(lines) == 1 else "".join(f"\n  {line}" for line in lines)
+        raise UserError(f"{len(failures)} of {objects} objects could not be {done}:{details}")
 
 
 class ObjectLists(NamedTuple):

@@ -108,9 +108,9 @@ def _field_of_view(content: dict[str, Any], frame: dict[str, Any], path: Path) -
             wanted = "fl_x and fl_y must be equal, and cx and cy the image's middle"
             raise UserError(f"{path}: the views' pixels must be square and their cameras centred: {wanted}")
         angle = 2 * math.atan(width / 2 / focal)
-        told = float(own.get("camera_angle_x", angle))
-        if not abs(told - angle) <= LARGEST_OFFSET:
-            raise UserError(f"{path}: camera_angle_x is {told:.4g}, but fl_x and w give {angle:.4g} radians")
+        stated = float(own.get("camera_angle_x", angle))
+        if not abs(stated - angle) <= LARGEST_OFFSET:
+            raise UserError(f"{path}: camera_angle_x is {stated:.4g}, but fl_x and w give {angle:.4g} radians")
     if not 0 < angle < math.pi:
         raise UserError(f"{path}: camera_angle_x must be an angle in radians between 0 and pi, got {angle}")
     return angle

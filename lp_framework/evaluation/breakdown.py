@@ -90,21 +90,21 @@ def _intervals(error: NDArray, objects: NDArray) -> dict[str, list[float]]:
     return found
 
 
-def lines(told: Mapping[str, Any]) -> list[str]:
+def lines(details: Mapping[str, Any]) -> list[str]:
     """Format the breakdown for the terminal."""
 
     def rates(row: Mapping[str, Any]) -> str:
         shares = (row[f"R(R)@{degrees}"] for degrees in THRESHOLDS)
         return "/".join("-" if share is None else f"{share:.2f}".removeprefix("0") for share in shares)
 
-    by_longitude = ", ".join(f"{row['from']}-{row['to']}° {rates(row)}" for row in told["by_longitude"])
-    best_of = ", ".join(f"{row['starts']}: {rates(row)}" for row in told["best_of"])
-    low, high = told["interval"]["R(R)@30"]
-    said = [
-        f"unique answer, {told['pairs']} pairs, R(R)@15/R(R)@30 by difference of longitude: {by_longitude}",
+    by_longitude = ", ".join(f"{row['from']}-{row['to']}° {rates(row)}" for row in details["by_longitude"])
+    best_of = ", ".join(f"{row['starts']}: {rates(row)}" for row in details["best_of"])
+    low, high = details["interval"]["R(R)@30"]
+    text = [
+        f"unique answer, {details['pairs']} pairs, R(R)@15/R(R)@30 by difference of longitude: {by_longitude}",
         f"  the best of the first starts, {best_of}; R(R)@30 of other objects (95%): {low:.2f} to {high:.2f}",
     ]
-    if told["calibration"]:
-        mean, gap = told["calibration"]["mean_probability"], told["calibration"]["error"]
-        said.append(f"  mean probability of an error within 30°: {mean:.2f}, expected calibration error {gap:.3f}")
-    return said
+    if details["calibration"]:
+        mean, gap = details["calibration"]["mean_probability"], details["calibration"]["error"]
+        text.append(f"  mean probability of an error within 30°: {mean:.2f}, expected calibration error {gap:.3f}")
+    return text

@@ -96,11 +96,11 @@ class MatchingModel(PoseModel):
 
     def condition(self, reference: ViewCells, query: ViewCells) -> PoseDensity:
         """The densities of P pairs, given the cells of both views; averages over the views and their mirror images."""
-        told = self._density(reference.flattened(), query.flattened())
-        straight, mirrored = told.logits.log_softmax(dim=-1).unflatten(0, (-1, 2)).unbind(dim=1)
+        density = self._density(reference.flattened(), query.flattened())
+        straight, mirrored = density.logits.log_softmax(dim=-1).unflatten(0, (-1, 2)).unbind(dim=1)
         logits = torch.logaddexp(straight, mirrored.flip(-1).roll(1, -1)) / self.temperature
-        mean = told.mean.unflatten(0, (-1, 2))
-        variance = told.deviation.square().unflatten(0, (-1, 2)).mean(dim=1) + mean.var(dim=1, correction=0)
+        mean = density.mean.unflatten(0, (-1, 2))
+        variance = density.deviation.square().unflatten(0, (-1, 2)).mean(dim=1) + mean.var(dim=1, correction=0)
         return PoseDensity(logits, mean.mean(dim=1), variance.sqrt(), self.sigma)
 
     def field(self, condition: PoseDensity, pose: Tensor) -> FieldValue:
@@ -157,7 +157,7 @@ class MatchingModel(PoseModel):
         features, coverage, cells = self._foremost(maps, self.training_cells, random)
         features = self._standardised(features, coverage)
         features = features + self.feature_noise * torch.randn(features.shape, generator=random).to(features)
-        views, told_points = self.encoder(features, coverage, cells)
+        views, predicted_points = self.encoder(features, coverage, cells)
         pairs = self._some_pairs(batch, random)
         reference, query = batch.reference[pairs], batch.query[pairs]
         density = self._density(views[reference], views[query])
@@ -168,7 +168,7 @@ class MatchingModel(PoseModel):
             "longitude": -density.log_prob(true[:, 1]).mean(),
             "shift": 0.5 * self._shift_loss(density, true, cropped[reference] | cropped[query]),
             "view": 0.5 * _mean_without_crops_radii((views.pose - placed).abs(), cropped),
-            **self._geometry_losses(views, told_points, _taken(points, cells), poses, reference, query),
+            **self._geometry_losses(views, predicted_points, _taken(points, cells), poses, reference, query),
         }
         for name, value in losses.items():
             self.log(f"train/{name}", value, batch_size=len(pairs))
@@ -212,14 +212,14 @@ class MatchingModel(PoseModel):
         return _mean_without_crops_radii(loss, cropped)
 
     def _geometry_losses(
-        self, views: ViewCells, told: Tensor, points: Tensor, poses: Tensor, reference: Tensor, query: Tensor
+        self, views: ViewCells, predicted: Tensor, points: Tensor, poses: Tensor, reference: Tensor, query: Tensor
     ) -> dict[str, Tensor]:
         """Losses supervised by rendered depth; `points` `[I, K, 3]` in the object's frame, NaN on the background."""
         seen = points.isfinite().all(dim=-1, keepdim=True)
         upright = _turned(points.nan_to_num(), -poses[:, 1])  # as seen from longitude 0
-        point_loss = ((told - POINT_SCALE * upright).abs() * seen).sum() / seen.sum() / 3
+        point_loss = ((predicted - POINT_SCALE * upright).abs() * seen).sum() / seen.sum() / 3
         distance = upright[..., ::2].norm(dim=-1, keepdim=True)
-        phase = torch.atan2(upright[..., :1], upright[..., 2:]) * torch.arange(HARMONICS + 1, device=told.device)
+        phase = torch.atan2(upright[..., :1], upright[..., 2:]) * torch.arange(HARMONICS + 1, device=points.device)
         azimuth = torch.cat([phase.cos(), phase[..., 1:].sin()], dim=-1) * (distance / NEAR_AXIS).clamp(max=1)
         azimuth_loss = ((views.azimuth - azimuth).square() * seen).mean() * seen.numel() / seen.sum()
         near = (poses[query, 1] - poses[reference, 1]).cos() > math.cos(OVERLAPPING)
@@ -234,14 +234,14 @@ class MatchingModel(PoseModel):
         """Cross entropy between predicted and true matches; cells without a match have weight 1/4."""
         if len(reference) == 0:
             return points.new_zeros(())
-        ours, theirs = points[reference], points[query]
-        seen, seen_ = (each.isfinite().all(dim=-1) for each in (ours, theirs))
-        distance = torch.cdist(ours.nan_to_num(9.0), theirs.nan_to_num(-9.0))
+        first, second = points[reference], points[query]
+        seen_first, seen_second = (each.isfinite().all(dim=-1) for each in (first, second))
+        distance = torch.cdist(first.nan_to_num(9.0), second.nan_to_num(-9.0))
         same = torch.exp(-0.5 * (distance / SAME_POINT).square()) * (distance < 2.4 * SAME_POINT)
         with torch.autocast(points.device.type, enabled=False):
             rows, columns = self.voting.matches(views[reference], views[query])
         loss = points.new_zeros(())
-        for log_prob, true, known in ((rows, same, seen), (columns.mT, same.mT, seen_)):
+        for log_prob, true, known in ((rows, same, seen_first), (columns.mT, same.mT, seen_second)):
             total = true.sum(dim=-1, keepdim=True)
             none = (total < 1e-3).float()
             wanted = torch.cat([true / (total + 1e-6) * (1 - none), none], dim=-1)

@@ -148,12 +148,12 @@ class Voting(nn.Module):
     def matches(self, reference: ViewCells, query: ViewCells) -> tuple[Tensor, Tensor]:
         """Log-probabilities of matches: for each reference cell over the query's cells and no match `[P, K, K + 1]`,
         and for each query cell over the reference's cells and no match `[P, K + 1, K]`."""
-        alike = reference.descriptor @ query.descriptor.transpose(1, 2) * self.temperature.exp()
-        alike = alike.masked_fill(reference.shown == 0, -30.0).masked_fill(query.shown.transpose(1, 2) == 0, -30.0)
-        none = self.no_match.expand(len(alike), alike.shape[1], 1)
-        rows = torch.cat([alike, none], dim=2).log_softmax(dim=2)
-        none = self.no_match.expand(len(alike), 1, alike.shape[2])
-        return rows, torch.cat([alike, none], dim=1).log_softmax(dim=1)
+        logits = reference.descriptor @ query.descriptor.transpose(1, 2) * self.temperature.exp()
+        logits = logits.masked_fill(reference.shown == 0, -30.0).masked_fill(query.shown.transpose(1, 2) == 0, -30.0)
+        none = self.no_match.expand(len(logits), logits.shape[1], 1)
+        rows = torch.cat([logits, none], dim=2).log_softmax(dim=2)
+        none = self.no_match.expand(len(logits), 1, logits.shape[2])
+        return rows, torch.cat([logits, none], dim=1).log_softmax(dim=1)
 
     def forward(self, reference: ViewCells, query: ViewCells) -> tuple[Tensor, Tensor, Tensor]:
         """Logits `[P, BINS]`; mean and log-deviation `[P, 2]` of latitude and radius, in units of `POSE_SCALE`."""
@@ -166,19 +166,19 @@ class Voting(nn.Module):
         curves = torch.cat([0.3 * votes, votes / (spread + 0.05), 0.5 * amount], dim=1)
         logits = self.read(curves).squeeze(1) + self.vote_scale * votes.mean(dim=1)
         moments = (reference.moments.transpose(1, 2) @ (weight @ query.moments)).flatten(1) / (count + 0.1)
-        told = self.from_moments(torch.cat([moments, (count + 0.1).log()], dim=1))
+        shift = self.from_moments(torch.cat([moments, (count + 0.1).log()], dim=1))
         forth = self.from_views(torch.cat([query.pooled, reference.pooled], dim=-1))
         back = self.from_views(torch.cat([reference.pooled, query.pooled], dim=-1))
-        return logits, told[:, :2] + query.pose - reference.pose + forth - back, told[:, 2:]
+        return logits, shift[:, :2] + query.pose - reference.pose + forth - back, shift[:, 2:]
 
     def _votes(self, reference: ViewCells, query: ViewCells, weight: Tensor) -> Tensor:
         """Votes `[P, polls, BINS]` for each longitude: sum over matches of cos(k (azimuth - azimuth' - longitude))."""
         pairs, cells, polls = reference.gates.shape
-        ours = reference.gates[..., None] * reference.azimuth[:, :, None]
-        theirs = (query.gates[..., None] * query.azimuth[:, :, None]).flatten(2)
-        theirs = (weight @ theirs).view(pairs, cells, polls, -1)
-        cosine, sine = ours.split([HARMONICS + 1, HARMONICS], dim=-1)
-        cosine_, sine_ = theirs.split([HARMONICS + 1, HARMONICS], dim=-1)
+        reference_votes = reference.gates[..., None] * reference.azimuth[:, :, None]
+        query_votes = (query.gates[..., None] * query.azimuth[:, :, None]).flatten(2)
+        query_votes = (weight @ query_votes).view(pairs, cells, polls, -1)
+        cosine, sine = reference_votes.split([HARMONICS + 1, HARMONICS], dim=-1)
+        cosine_, sine_ = query_votes.split([HARMONICS + 1, HARMONICS], dim=-1)
         zero = sine.new_zeros(*sine.shape[:-1], 1)
         sine, sine_ = torch.cat([zero, sine], dim=-1), torch.cat([zero, sine_], dim=-1)
         real = (cosine * cosine_ + sine * sine_).sum(dim=1)

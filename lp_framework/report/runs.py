@@ -112,8 +112,8 @@ def read_run(folder: Path) -> Run:
     except FileNotFoundError as error:
         raise UserError(f"unfinished: no {RESULT}") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        told = f"{type(error).__name__}: {error}"
-        raise UserError(f"damaged: {file} cannot be read as the result of an evaluation ({told})") from error
+        cause = f"{type(error).__name__}: {error}"
+        raise UserError(f"damaged: {file} cannot be read as the result of an evaluation ({cause})") from error
 
 
 def settings(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,13 +27,14 @@ def joint_density(density: PoseDensity, sets: int, ids: Tensor, seed: int) -> Po
     """The densities of S x (V - 1) views relative to the first, from those of all ordered pairs `[S x V x (V - 1)]`
     (by reference, then query). Draws are keyed by `seed` and the sets' `ids` `[S]`."""
     views = round((1 + math.sqrt(1 + 4 * len(density.logits) / sets)) / 2)
-    told = _table(density.logits.log_softmax(dim=-1), sets, views)
-    told = (told + told.transpose(1, 2).flip(-1).roll(1, -1)) / 2  # average with the reversed pair, longitude negated
-    places = _climbed(told, _drawn(told, ids, seed))
-    mean, deviation = _agreed(
+    log_prob = _table(density.logits.log_softmax(dim=-1), sets, views)
+    log_prob = (log_prob + log_prob.transpose(1, 2).flip(-1).roll(1, -1)) / 2  # average with the reversed pair
+    places = _ascended(log_prob, _sampled(log_prob, ids, seed))
+    mean, deviation = _combined(
         _table(density.mean, sets, views), _table(density.deviation.square().reciprocal(), sets, views)
     )
-    return PoseDensity(_mixture(told, places).flatten(0, 1), mean.flatten(0, 1), deviation.flatten(0, 1), density.sigma)
+    mixture = _mixture(log_prob, places).flatten(0, 1)
+    return PoseDensity(mixture, mean.flatten(0, 1), deviation.flatten(0, 1), density.sigma)
 
 
 def _table(values: Tensor, sets: int, views: int) -> Tensor:
@@ -44,19 +45,19 @@ def _table(values: Tensor, sets: int, views: int) -> Tensor:
     return table
 
 
-def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:
+def _sampled(log_prob: Tensor, ids: Tensor, seed: int) -> Tensor:
     """Sample longitudes `[S, H, V]` (grid indices) along random trees of pairs, preferring peaked densities."""
-    sets, views = told.shape[:2]
+    sets, views = log_prob.shape[:2]
     uniform = keyed_uniform(
         seed, _TREES, ids[:, None, None], torch.arange(HYPOTHESES)[:, None], torch.arange(views - 1), count=2
-    ).to(told)
-    peak = told.exp().amax(dim=-1)[:, None].expand(-1, HYPOTHESES, -1, -1)
-    cumulated = told.exp().cumsum(dim=-1)
-    placed = torch.zeros(sets, HYPOTHESES, views, dtype=torch.bool, device=told.device)
+    ).to(log_prob)
+    peak = log_prob.exp().amax(dim=-1)[:, None].expand(-1, HYPOTHESES, -1, -1)
+    cumulated = log_prob.exp().cumsum(dim=-1)
+    placed = torch.zeros(sets, HYPOTHESES, views, dtype=torch.bool, device=log_prob.device)
     placed[..., 0] = True
-    places = torch.zeros(sets, HYPOTHESES, views, dtype=torch.long, device=told.device)
+    places = torch.zeros(sets, HYPOTHESES, views, dtype=torch.long, device=log_prob.device)
     row, column = torch.meshgrid(
-        torch.arange(sets, device=told.device), torch.arange(HYPOTHESES, device=told.device), indexing="ij"
+        torch.arange(sets, device=log_prob.device), torch.arange(HYPOTHESES, device=log_prob.device), indexing="ij"
     )
     for step in range(views - 1):
         weight = (peak * placed[..., None] * ~placed[..., None, :]).flatten(2).cumsum(dim=-1)
@@ -69,41 +70,41 @@ def _drawn(told: Tensor, ids: Tensor, seed: int) -> Tensor:
     return places
 
 
-def _given_others(told: Tensor, places: Tensor, view: int) -> Tensor:
+def _given_others(log_prob: Tensor, places: Tensor, view: int) -> Tensor:
     """Log-densities of `view` given the other views, summed over their pairs, `[S, H, GRID]`."""
-    turn = (torch.arange(GRID, device=told.device) - places[..., None]) % GRID  # [S, H, V, GRID]
-    of_view = told[:, None, :, view].expand(-1, places.shape[1], -1, -1)
+    turn = (torch.arange(GRID, device=log_prob.device) - places[..., None]) % GRID  # [S, H, V, GRID]
+    of_view = log_prob[:, None, :, view].expand(-1, places.shape[1], -1, -1)
     return of_view.gather(-1, turn).sum(dim=2) - of_view[:, :, view].gather(-1, turn[:, :, view])
 
 
-def _climbed(told: Tensor, places: Tensor) -> Tensor:
+def _ascended(log_prob: Tensor, places: Tensor) -> Tensor:
     """Move each hypothesis to a local maximum by coordinate ascent over the views, for at most `SWEEPS` sweeps."""
     for _ in range(SWEEPS):
         before = places.clone()
-        for view in range(1, told.shape[1]):
-            places[..., view] = _given_others(told, places, view).argmax(dim=-1)
+        for view in range(1, log_prob.shape[1]):
+            places[..., view] = _given_others(log_prob, places, view).argmax(dim=-1)
         if torch.equal(before, places):
             break
     return places
 
 
-def _mixture(told: Tensor, places: Tensor) -> Tensor:
+def _mixture(log_prob: Tensor, places: Tensor) -> Tensor:
     """Log-densities `[S, V - 1, GRID]` of all views except the first."""
     _, hypotheses, views = places.shape
     turn = (places[:, :, None] - places[..., None]) % GRID  # [S, H, V, V]
-    at = told[:, None].expand(-1, hypotheses, -1, -1, -1).gather(-1, turn[..., None])[..., 0]
+    at = log_prob[:, None].expand(-1, hypotheses, -1, -1, -1).gather(-1, turn[..., None])[..., 0]
     witnesses = (views - 1) ** DEPENDENCE
     score = at.sum(dim=(2, 3)) / 2 / witnesses  # the diagonal is 0
     same = (places[:, :, None] == places[:, None]).all(dim=-1).tril(-1).any(dim=-1)  # duplicates of an earlier one
     share = score.masked_fill(same, -torch.inf).log_softmax(dim=-1)[..., None]
     others = [
-        (share + (_given_others(told, places, view) / witnesses).log_softmax(dim=-1)).logsumexp(dim=1)
+        (share + (_given_others(log_prob, places, view) / witnesses).log_softmax(dim=-1)).logsumexp(dim=1)
         for view in range(1, views)
     ]
     return torch.stack(others, dim=1)
 
 
-def _agreed(mean: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+def _combined(mean: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
     """Least-squares latitude and radius relative to the first view: values and deviations `[S, V - 1, 2]`, from the
     differences `[S, V, V, 2]` of ordered pairs; deviations as from a single pair, see above."""
     views = mean.shape[1]

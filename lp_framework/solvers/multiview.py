@@ -120,8 +120,8 @@ class MultiView(Solver):
         poses = starts.new_full((sets, views, views, starts.shape[2], 3), torch.nan)
         poses[:, reference, query] = solution.poses.unflatten(0, (sets, -1))
         weights = torch.zeros_like(poses[..., 0])
-        told = solution.energies.unflatten(0, (sets, -1))
-        weights[:, reference, query] = 1 / (told.square() + NEAREST**2)
+        distance = solution.energies.unflatten(0, (sets, -1))
+        weights[:, reference, query] = 1 / (distance.square() + NEAREST**2)
         return poses, weights.masked_fill(~weights.isfinite(), 0.0), solution.cost.network_passes
 
     def fit(self, measured: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -118,7 +118,7 @@ class CO3DData(PhotographedData):
             raise UserError(f"{file}: has no frame {missing[0]} of sequence '{sequence}', which the set list names")
         photographs = [_photograph(frames[number], self.download, file) for number in sorted(listed)]
         cloud, scores = _cloud_and_scores(folder / SEQUENCES, sequence, self.download)
-        with expecting(f"{folder / sequence}: the object's frame cannot be told"):
+        with expecting(f"{folder / sequence}: the object's frame cannot be determined"):
             return _in_object_frame(photographs, cloud, scores)
 
 
