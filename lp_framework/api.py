@@ -61,8 +61,8 @@ def estimate_pose(
     """
     prepared = []
     for name, picture in (("reference", reference), ("query", query)):
-        called = str(picture) if isinstance(picture, str | Path) else name
-        prepared.append(prepare(open_picture(picture, called), called, None, remove_background, crop))
+        label = str(picture) if isinstance(picture, str | Path) else name
+        prepared.append(prepare(open_picture(picture, label), label, None, remove_background, crop))
     parts = _components([("solver", solver), ("start", starts)], prior, model)
     if isinstance(solver, str):
         solver = load_solver(solver, **parts)

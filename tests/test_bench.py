@@ -363,11 +363,11 @@ def test_a_pair_is_encoded_once_here_and_at_every_step_of_the_loop(priors, monke
     monkeypatch.setattr(Computing, "networks", lambda computing, device: None)
     monkeypatch.setattr(Computing, "prior", lambda computing, networks: priors[0])
     monkeypatch.setattr(zero123, "plain_prior", lambda networks: priors[1])
-    with Passes(priors[0]) as ours, Passes(priors[1]) as loop:
+    with Passes(priors[0]) as batched, Passes(priors[1]) as loop:
         model = load_model(SHIPPED / "score")
         measured = section()
         zero123.measure_pair(measured, Computing("narrow"), model, paper_seconds(), [2], steps=3, rounds=1)
-    assert ours == {"vae": [2] * 2, "clip": [2] * 2, "unet": [4] * 2 * 3}  # the first pair, and one more
+    assert batched == {"vae": [2] * 2, "clip": [2] * 2, "unet": [4] * 2 * 3}  # the first pair, and one more
     steps = 1 + 2 * 3  # to warm up, and of either start
     assert loop == {"vae": [2] * 2 * steps, "clip": [2] * steps, "unet": [2] * steps}
     assert [*measured.rows] == ["2 starts, seconds per pair"] and "on an RTX 6000 Ada" in measured.note

@@ -408,7 +408,7 @@ def test_names_mean_what_they_do_elsewhere_and_other_models_have_no_probability(
     torch.testing.assert_close(built.poses, solution.poses)
 
 
-def test_who_rests_on_the_prior_that_ships_is_warns(lp, clean_registry, caplog):
+def test_using_the_bundled_prior_for_photographs_warns(lp, clean_registry, caplog):
     def warns(*overrides: str) -> bool:
         printed = lp("estimate", "images=x", "--cfg", "job", *overrides).out
         caplog.clear()

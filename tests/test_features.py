@@ -127,7 +127,7 @@ def test_another_zoom_from_the_same_place_is_the_same_view():
 
 
 def test_views_on_disk_are_solved_with_their_own_fields_of_view(tmp_path):
-    """From `transform.json` to the solver; crops to the object have lost theirs."""
+    """From `transform.json` to the solver; crops to the object have none."""
     path = write_split(tmp_path / "cup" / "test", random_poses(3, "any"), size=64)
     content = json.loads(path.read_text())
     content["frames"][1]["camera_angle_x"] = 0.4
@@ -302,9 +302,9 @@ def test_the_foreground_is_what_is_not_white_and_what_lies_within_it():
 
 
 def test_mutual_and_ratio():
-    def match(ours: list[float], theirs: list[float], ratio: float = 0.8) -> list[tuple[float, float]]:
+    def match(reference: list[float], query: list[float], ratio: float = 0.8) -> list[tuple[float, float]]:
         described = []
-        for numbers in (ours, theirs):
+        for numbers in (reference, query):
             descriptors = np.zeros((len(numbers), 128), np.float32)
             descriptors[:, 0] = numbers
             described.append((np.array([[each, 0.0] for each in numbers]).reshape(-1, 2), descriptors))

@@ -270,9 +270,9 @@ def journal(tmp_path_factory) -> tuple[Path, dict, SolvedBatch]:
     pair, numbers = torch.tensor([[3, 4], [5, 3]]), {name: torch.tensor([3, 5]) for name in ("object", "chosen")}
     sure = torch.tensor([0.5, math.nan], dtype=torch.float64)
     batch = SolvedBatch(pair, **numbers, **rows, probability=sure, seconds=0.5, passes=3)
-    begun = Journal(folder, subject)
-    assert begun.begin("a") == []
-    begun.append(batch, 0)
+    journal = Journal(folder, subject)
+    assert journal.begin("a") == []
+    journal.append(batch, 0)
     return folder, subject, batch
 
 

@@ -50,13 +50,13 @@ def test_the_reference_followed_by_the_relative_camera_is_the_query(batch):
 
 @pytest.mark.parametrize("batch", BATCHES)
 def test_opencvs_axes(batch):
-    ours = camera(*batch)
-    theirs = from_opencv(ours)  # its own inverse
-    torch.testing.assert_close(from_opencv(theirs), ours)
-    torch.testing.assert_close(theirs[..., :3, 2], -ours[..., :3, 2])  # it looks along +z
-    torch.testing.assert_close(theirs[..., :3, 1], -ours[..., :3, 1])
-    torch.testing.assert_close(theirs[..., :3, 3], ours[..., :3, 3])
-    assert (torch.linalg.det(theirs[..., :3, :3]) > 0).all()
+    opengl = camera(*batch)
+    opencv = from_opencv(opengl)  # its own inverse
+    torch.testing.assert_close(from_opencv(opencv), opengl)
+    torch.testing.assert_close(opencv[..., :3, 2], -opengl[..., :3, 2])  # it looks along +z
+    torch.testing.assert_close(opencv[..., :3, 1], -opengl[..., :3, 1])
+    torch.testing.assert_close(opencv[..., :3, 3], opengl[..., :3, 3])
+    assert (torch.linalg.det(opencv[..., :3, :3]) > 0).all()
 
 
 # ---------------------------------------------------------------- optimal scale
@@ -129,7 +129,7 @@ def test_where_the_lines_of_sight_do_not_meet_in_front_the_radius_stays():
 
 
 def test_a_small_error_of_the_camera_is_a_small_error_of_the_pose():
-    """Also where cameras are nearly the same, where latitudes themselves cannot be told."""
+    """Also where cameras are nearly the same, where latitudes themselves are undetermined."""
     reference = view_poses(200, 4)
     query = reference + torch.tensor([0.05, 0.001, 0.1], dtype=torch.float64)
     exact = relative_camera(camera_to_world(reference), camera_to_world(query))

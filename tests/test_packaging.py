@@ -62,13 +62,13 @@ def test_the_wheel_holds_every_file_of_the_package_the_configs_and_the_licence(w
 def test_the_installed_command_finds_its_configs_plugins_and_weights_from_another_folder(installed, tmp_path):
     """In few processes, because each imports PyTorch."""
     assert run(installed / "lp", "--version", cwd=tmp_path).stdout == "lp_framework 0.1.0\n"
-    module, conf, config, listing, ours = run(installed / "python", "-c", INSTALLED, cwd=tmp_path).stdout.split(PART)
+    module, conf, config, listing, prior = run(installed / "python", "-c", INSTALLED, cwd=tmp_path).stdout.split(PART)
     assert Path(conf) == Path(module).parent / "conf" and ROOT not in Path(conf).parents
     chosen = OmegaConf.create(config)
     assert chosen.model.name == "score"
     assert chosen.backbone == {"name": "color_grid", "grid": 8, "features": 128, "image_size": 64}
     assert re.search(r"^color_grid +package lp-color-grid 0\.1\.0 +grid=8, ", listing, re.MULTILINE)
-    assert ours == "(192, 1, 1) 9\n"
+    assert prior == "(192, 1, 1) 9\n"
 
 
 PART = "-" * 20

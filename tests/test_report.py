@@ -185,7 +185,7 @@ def test_models_that_differ_in_their_seed_are_one_row_and_other_models_are_not(t
     assert [row.label for row in table.paper.matching(table.rows[0].settings)] == ["Energy"]
 
 
-def test_models_of_one_name_are_told_apart_by_their_paths(tmp_path):
+def test_models_of_one_name_are_distinguished_by_their_paths(tmp_path):
     for name, epochs in (("short", 1), ("long", 60)):
         checkpoint = training_run(tmp_path / "train" / name, "score", 0, epochs)
         write_result(tmp_path / "runs" / name, checkpoint=checkpoint)
@@ -266,9 +266,9 @@ def test_choices_are_drawn_beside_each_other_and_one_row_is_no_figure(tmp_path):
 
 def test_curves_of_one_label_share_a_colour_and_nothing_is_outside_the_axes():
     x, nan = np.array([0.0, 1.0]), np.full(2, np.nan)
-    ours, theirs = Curve("a", x, np.array([0.13, 0.5]), nan), Curve("a", x, np.array([0.4, 0.6]), nan, paper=True)
+    own, paper = Curve("a", x, np.array([0.13, 0.5]), nan), Curve("a", x, np.array([0.4, 0.6]), nan, paper=True)
     other = Curve("b", x, np.array([0.7, 0.9]), np.array([0.1, 0.1]))
-    axes = curves_figure([Panel("p", "x", [ours, theirs, other])]).axes[0]
+    axes = curves_figure([Panel("p", "x", [own, paper, other])]).axes[0]
     first, second, third = (line for line in axes.lines if line.get_marker() not in ("_", "|"))
     assert first.get_color() == second.get_color() != third.get_color()
     assert second.get_markerfacecolor() == "white" and axes.get_ylim()[0] <= 0.13

@@ -181,8 +181,8 @@ def test_the_papers_alternatives_train(commands):
 
 @pytest.mark.heavy
 def test_resuming_after_kill_9_gives_the_weights_of_an_uninterrupted_run(commands, whole, killed):
-    begun = killed.checkpoint()
-    assert 1 <= begun["epoch"] + 1 < 6  # it was killed on the way
+    last = killed.checkpoint()
+    assert 1 <= last["epoch"] + 1 < 6  # it was killed on the way
     resumed = commands.here("resumed", "train", "resume=killed")
     assert resumed.status == 0, resumed.err
     end, wanted = killed.checkpoint(), whole.checkpoint()

@@ -77,9 +77,9 @@ def worth(amount: float, do: Callable[[], object]) -> Work:
 
 def timed(work: Callable[[], _Result], device: torch.device) -> tuple[float, _Result]:
     """Run the work; returns the seconds and its result."""
-    began = now(device)
+    start = now(device)
     result = work()
-    return now(device) - began, result
+    return now(device) - start, result
 
 
 def peak_bytes(work: Callable[[], object], weights: nn.Module, device: torch.device) -> int:

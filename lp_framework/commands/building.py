@@ -159,10 +159,10 @@ def resumable(folder: Path, kept: str) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, SystemExit, DiskFull) as error:  # Lightning exits after an interruption
-        begun = any((folder / kept).glob("*"))
+        saved = any((folder / kept).glob("*"))
         if not isinstance(error, DiskFull):
-            raise KeyboardInterrupt(f"interrupted; resume={folder} resumes it" if begun else "interrupted") from error
-        if not begun:
+            raise KeyboardInterrupt(f"interrupted; resume={folder} resumes it" if saved else "interrupted") from error
+        if not saved:
             raise
         raise DiskFull(f"{error}; make room, then resume={folder} resumes it") from error
 

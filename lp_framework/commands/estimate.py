@@ -78,8 +78,8 @@ def _print(folder: Path, found: Estimate, written: Written) -> None:
         table.add_row(file.name, *([*texts, energy] if is_pose else ["none"]))
     console.print(table)
     for (file, *_), answer in zip(rows[1:], found.answers, strict=bool(found.answers)):
-        way = f"{rows[0][0].name} to {file.name}: {answer.words}"
-        console.print(f"{way}; {answer.reason}: {answer.verdict}" if answer.verdict else way, soft_wrap=True)
+        line = f"{rows[0][0].name} to {file.name}: {answer.words}"
+        console.print(f"{line}; {answer.reason}: {answer.verdict}" if answer.verdict else line, soft_wrap=True)
         if answer.second_words:
             console.print(f"  second: {answer.second_words}", soft_wrap=True)
     if found.radius_lost:

@@ -64,7 +64,7 @@ def run(config: DictConfig) -> None:
     building.warn_of_unused(components)
     solver, starts, data = components["solver"], components["start"], components["data"]
     subject |= {"weights": building.weights_fingerprint(solver.networks()), "versions": building.versions()}
-    before = journal.begun(folder, subject)
+    before = journal.to_resume(folder, subject)
     kept = journal.Journal(folder, subject)
     trainer = building.build_trainer(settings["trainer"], folder, [RichProgressBar(leave=False)], logger=[])
     batch_pairs = pairs_at_once(settings["batch_pairs"], solver, starts)

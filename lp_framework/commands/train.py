@@ -38,21 +38,21 @@ def run(config: DictConfig) -> None:
     """Train into this run's folder. Resumes the run in the folder `resume`, or this run if it was stopped."""
     folder = building.run_folder() if config.resume is None else Path(config.resume)
     saved, last = folder / "config.yaml", folder / FOLDER / LAST
-    begun = last.is_file()
+    resuming = last.is_file()
     if config.resume is not None:
-        if not begun:
+        if not resuming:
             raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
         # A run may be extended or moved to other devices.
         config = building.with_overrides(OmegaConf.create(saved_config(saved)), config, ("trainer",), saved)
-    elif begun and saved_config(saved) != building.plain(config):  # never overwrite another training
+    elif resuming and saved_config(saved) != building.plain(config):  # never overwrite another training
         raise UserError(
             f"{folder}: holds a training run with other settings; resume={folder} resumes it, or give another "
             "hydra.run.dir for this one"
         )
     settings = building.plain(config)
     _check(settings)
-    checkpoint, epochs = read_checkpoint(last) if begun else {}, settings["trainer"]["max_epochs"]
-    if begun:
+    checkpoint, epochs = read_checkpoint(last) if resuming else {}, settings["trainer"]["max_epochs"]
+    if resuming:
         reported = all((folder / name).is_file() for name in (building.TRAINING, PAGE))
         if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and reported:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -74,7 +74,7 @@ def run(config: DictConfig) -> None:
     if trainer.is_global_zero:
         write_text(saved, OmegaConf.to_yaml(config))
     with building.resumable(folder, FOLDER):
-        trainer.fit(model, datamodule=data, ckpt_path=last if begun else None, weights_only=True)
+        trainer.fit(model, datamodule=data, ckpt_path=last if resuming else None, weights_only=True)
         if trainer.is_global_zero:
             report(trainer, folder, settings, data)
 

@@ -104,8 +104,8 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
     `UserError` for an image that does not decode or is not square."""
 
     def decode(image: Image.Image) -> NDArray[np.uint8]:
-        called = str(getattr(image, "filename", "a view"))
-        return pixels_on_white(prepare(eight_bit(image).convert("RGBA"), called) if crop else image, size)
+        name = str(getattr(image, "filename", "a view"))
+        return pixels_on_white(prepare(eight_bit(image).convert("RGBA"), name) if crop else image, size)
 
     def blocks() -> Iterator[NDArray[np.uint8]]:
         for file in tracked(files, "decoding views"):

@@ -42,7 +42,7 @@ class Journal:
         """Return the batches solved before on data with the fingerprint `views`, or start a new journal and remove the
         results of a finished evaluation. Raises `UserError` for a journal of another evaluation."""
         now = {**self.subject, "views": views}
-        if begun(self.run, now) is not None:
+        if to_resume(self.run, now) is not None:
             return list(self._read())
         shutil.rmtree(self.folder, ignore_errors=True)
         (self.run / RESULT).unlink(missing_ok=True)
@@ -89,7 +89,7 @@ def unfinished(folder: Path) -> dict[str, Any] | None:
     return subject if whole else None
 
 
-def begun(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None:
+def to_resume(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None:
     """The subject of the `unfinished` evaluation if it contains `subject`, otherwise None. Raises `UserError` for
     another evaluation with solved batches."""
     before = unfinished(folder)
@@ -111,12 +111,12 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     'solver.gamma is 0.3 there, 0 here'
     """
     there, here = _compared(before), _compared({**before, **now})
-    said = []
+    found = []
     for key in sorted({*there, *here}):
         one, other = there.get(key), here.get(key)
         if one != other and ((key in there and key in here) or one or other):
-            said.append(f"other {key}" if key in ("views", "weights") else f"{key} is {one} there, {other} here")
-    return ", ".join(said[:3])
+            found.append(f"other {key}" if key in ("views", "weights") else f"{key} is {one} there, {other} here")
+    return ", ".join(found[:3])
 
 
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:

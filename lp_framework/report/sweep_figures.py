@@ -67,7 +67,7 @@ def draw_sweep(table: SweepTable, folder: Path) -> Sweep:
 def sweep_figure(table: SweepTable) -> Figure | None:
     """The figure that suits the varying settings: metrics over a number, or rows side by side; None for one row."""
     axis = next((key for key in AXES if is_swept(table, key)), None)
-    if axis is not None and len(table.apart_from(axis)) <= len(COLOURS):
+    if axis is not None and len(table.groups_along(axis)) <= len(COLOURS):
         return curves_figure(_panels(table, axis))
     if len(table.rows) < 2 and table.paper is None:
         return None
@@ -100,12 +100,12 @@ def curves_figure(panels: Sequence[Panel]) -> Figure:
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     for axes, panel in zip(row, panels, strict=True):
         for curve in panel.curves:
-            place, theirs = labels.index(curve.label) % len(COLOURS), curve.paper
+            place, paper = labels.index(curve.label) % len(COLOURS), curve.paper
             axes.errorbar(
-                curve.x, curve.mean, yerr=None if theirs else curve.std, color=COLOURS[place], marker=MARKERS[place],
-                markersize=4.5, markerfacecolor="white" if theirs else COLOURS[place], capsize=2, elinewidth=1.0,
-                linestyle=DASHES if theirs else "-", linewidth=1.0 if theirs else 1.5, clip_on=False,
-                zorder=2 if theirs else 3, label=PAPER if theirs else curve.label,
+                curve.x, curve.mean, yerr=None if paper else curve.std, color=COLOURS[place], marker=MARKERS[place],
+                markersize=4.5, markerfacecolor="white" if paper else COLOURS[place], capsize=2, elinewidth=1.0,
+                linestyle=DASHES if paper else "-", linewidth=1.0 if paper else 1.5, clip_on=False,
+                zorder=2 if paper else 3, label=PAPER if paper else curve.label,
             )  # fmt: skip
         axes.set_xlabel(panel.xlabel)
         if panel.xlabel == TIME:
@@ -179,7 +179,7 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
         by_time = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
         by_count = _panel(table, axis, "R@30 by number of starts", {"": "R@30"})
         return [by_count, _panel(table, axis, by_time, {"": "R@30"}, by_time=True)]
-    if len(table.apart_from(axis)) > 1:  # one colour each
+    if len(table.groups_along(axis)) > 1:  # one colour each
         return [_panel(table, axis, f"{title}, {WITHIN[-1]}", {"": each[-1]}) for title, each in PANELS.items()]
     return [_panel(table, axis, title, dict(zip(WITHIN, each, strict=True))) for title, each in PANELS.items()]
 
@@ -187,14 +187,14 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
 def _panel(table: SweepTable, axis: str, title: str, metrics: Mapping[str, str], by_time: bool = False) -> Panel:
     """One curve per combination of settings other than `axis` and per metric (label to name), ours and the paper's."""
     curves, over = [], None if by_time else axis
-    for rows in table.apart_from(axis):
+    for rows in table.groups_along(axis):
         words = label({key: value for key, value in rows[0].settings.items() if key != axis})
-        papers = [each for row in rows for each in table.papers(row.settings)]
+        comparable = [each for row in rows for each in table.paper_rows(row.settings)]
         for extra, name in metrics.items():
-            called = ", ".join(filter(None, [words, extra]))
-            curves.append(_curve(called, rows, over, name))
-            if theirs := [each for each in papers if name in each.metrics]:
-                curves.append(_curve(called, theirs, over, name))
+            curve_label = ", ".join(filter(None, [words, extra]))
+            curves.append(_curve(curve_label, rows, over, name))
+            if published := [each for each in comparable if name in each.metrics]:
+                curves.append(_curve(curve_label, published, over, name))
     return Panel(title, TIME if by_time else AXES[axis], curves)
 
 

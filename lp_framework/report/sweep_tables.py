@@ -65,7 +65,7 @@ class SweepTable:
     common: Mapping[str, Any]
     paper: PaperTable | None
 
-    def apart_from(self, axis: str) -> list[list[Row]]:
+    def groups_along(self, axis: str) -> list[list[Row]]:
         """Group the rows so that within each group only the setting `axis` differs."""
         others = [key for key in self.columns if key != axis]
         groups: dict[str, list[Row]] = {}
@@ -73,7 +73,7 @@ class SweepTable:
             groups.setdefault(json.dumps([row.settings.get(key) for key in others]), []).append(row)
         return list(groups.values())
 
-    def papers(self, settings: Mapping[str, Any] | None = None) -> list[Row]:
+    def paper_rows(self, settings: Mapping[str, Any] | None = None) -> list[Row]:
         """The paper's rows: all, or those comparable to a run with these settings."""
         if self.paper is None:
             return []
@@ -85,8 +85,8 @@ class SweepTable:
 
     def with_paper(self) -> list[Row]:
         """The rows, each followed by the comparable rows of the paper; the paper's other rows come last."""
-        rows = [each for row in self.rows for each in (row, *self.papers(row.settings))]
-        return rows + [each for each in self.papers() if each not in rows]
+        rows = [each for row in self.rows for each in (row, *self.paper_rows(row.settings))]
+        return rows + [each for each in self.paper_rows() if each not in rows]
 
 
 def sweep_tables(runs: Sequence[Run], objects: Objects) -> tuple[list[SweepTable], list[LeftOut]]:
@@ -119,19 +119,19 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
     ['solver.name']
     """
 
-    def told_apart(keys: Sequence[str]) -> int:
+    def distinguished(keys: Sequence[str]) -> int:
         return len({json.dumps({key: each[key] for key in keys if key in each}) for each in settings})
 
-    def said_by_choice(key: str) -> bool:
+    def implied_by_choice(key: str) -> bool:
         choice = f"{key.rpartition('.')[0]}.name"
         names = {each.get(choice) for each in settings if key in each}
         groups = [[each for each in settings if each.get(choice) == name] for name in names]
         return key != choice and len(names) > 1 and all(len(_values(group, key)) == 1 for group in groups)
 
     keys = list(dict.fromkeys(key for each in settings for key in each))
-    chosen = [key for key in keys if len(_values(settings, key)) > 1 and not said_by_choice(key)]
+    chosen = [key for key in keys if len(_values(settings, key)) > 1 and not implied_by_choice(key)]
     for key in keys:
-        if told_apart([*chosen, key]) > told_apart(chosen):
+        if distinguished([*chosen, key]) > distinguished(chosen):
             chosen.append(key)
     return sorted(chosen, key=lambda key: (not key.endswith(".name"), keys.index(key)))
 
@@ -212,8 +212,8 @@ def layout(table: SweepTable) -> Layout:
     labels = [*map(heading, table.columns), "runs"]
     lines = []
     for row in table.with_paper():
-        ours = [*(shown(row.settings.get(key)) for key in table.columns), str(len(row.runs))]
-        cells = [row.source, *[""] * len(table.columns)] if row.paper else ours
+        own = [*(shown(row.settings.get(key)) for key in table.columns), str(len(row.runs))]
+        cells = [row.source, *[""] * len(table.columns)] if row.paper else own
         lines.append(([*cells, *(_cell(name, row.metrics.get(name)) for name in PRINTED)], row.paper))
     return Layout([*labels, *(HEADINGS.get(name, name) for name in PRINTED)], len(labels), lines)
 
@@ -253,7 +253,7 @@ def csv_rows(tables: Sequence[SweepTable]) -> tuple[list[str], list[list[object]
     columns += [f"{name}{part}" for name in METRICS for part in ("", "_std")]
     rows: list[list[object]] = []
     for table in tables:
-        for row in [*table.rows, *table.papers()]:
+        for row in [*table.rows, *table.paper_rows()]:
             settings = [row.settings.get(key) for key in keys]
             spreads = [row.metrics.get(name, Spread(math.nan)) for name in METRICS]
             metrics = [_rounded(each) for spread in spreads for each in (spread.mean, spread.std)]

@@ -167,13 +167,13 @@ def timed(solve: _Solve) -> _Solve:
 
     @wraps(solve)
     @torch.no_grad()
-    def whole(self: Solver, problems: Pairs | ViewSets, starts: Tensor, seed: int) -> Any:
+    def wrapper(self: Solver, problems: Pairs | ViewSets, starts: Tensor, seed: int) -> Any:
         check_starts(problems, starts)
-        began = now(starts.device)
+        start = now(starts.device)
         solution = solve(self, problems, starts, seed)
-        return replace(solution, cost=replace(solution.cost, seconds=now(starts.device) - began))
+        return replace(solution, cost=replace(solution.cost, seconds=now(starts.device) - start))
 
-    return cast(_Solve, whole)
+    return cast(_Solve, wrapper)
 
 
 class NetworkUser:

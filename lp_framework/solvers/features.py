@@ -155,11 +155,11 @@ class Sift:
         first, second = np.array(mutual, dtype=int).reshape(-1, 2).T
         return Matches(reference[0][first], query[0][second])
 
-    def _pairs(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]) -> dict[int, int]:
-        """Map each of our descriptors that passes the ratio test to its nearest neighbour among theirs."""
-        if len(theirs) < 2:
+    def _pairs(self, source: NDArray[np.float32], target: NDArray[np.float32]) -> dict[int, int]:
+        """Map each source descriptor that passes the ratio test to its nearest neighbour among the target ones."""
+        if len(target) < 2:
             return {}
-        two = self.nearest.knnMatch(ours, theirs, k=2)
+        two = self.nearest.knnMatch(source, target, k=2)
         return {near.queryIdx: near.trainIdx for near, far in two if near.distance < self.ratio * far.distance}
 
 

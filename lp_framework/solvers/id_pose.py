@@ -131,8 +131,8 @@ class IDPose(Solver):
         def one_direction(poses: Tensor, step: int) -> Tensor:
             pairs, noise = energy.pairs, energy.noise(step)[:, 0, step % 2]
             if step % 2 == 0:
-                return self._one_way(energy, pairs.query, pairs.reference, poses, noise)
-            return self._one_way(energy, pairs.reference, pairs.query, -poses, noise)
+                return self._errors(energy, pairs.query, pairs.reference, poses, noise)
+            return self._errors(energy, pairs.reference, pairs.query, -poses, noise)
 
         steps, rate = self.exploration_steps, GradientDescent(poses, self.exploration_rate)
         trajectory, _, valid = descend(one_direction, lambda poses: poses, poses, steps, rate)
@@ -171,7 +171,7 @@ class IDPose(Solver):
             poses = torch.where(moved[step][..., None], poses, poses.detach())
             noise = keyed_noise(self.prior, ids.device, energy.seed, _REFINEMENT, keys, step)
             relative = (poses[:, target] - poses[:, source])[:, None]
-            return self._one_way(energy, views[:, target], views[:, source], relative, noise)
+            return self._errors(energy, views[:, target], views[:, source], relative, noise)
 
         flat = selected.flatten(1)[:, None]
         rate = GradientDescent(flat, self.refinement_rate)
@@ -193,8 +193,8 @@ class IDPose(Solver):
         moved = torch.where(torch.minimum(source, target) > 0, of_two, torch.maximum(source, target))
         return one_hot(moved, others + 1).bool()
 
-    def _one_way(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
-        """Denoising errors `[B, N]` of images `target` from `source`, `[B]`, at poses `[B, N, 3]`, a noise per row."""
+    def _errors(self, energy: PairEnergy, target: Tensor, source: Tensor, poses: Tensor, noise: Tensor) -> Tensor:
+        """Denoising errors `[B, N]` of images `target` from `source` `[B]` at poses `[B, N, 3]`; one noise per row."""
         count, timestep = poses.shape[1], int(self.timestep * self.prior.num_timesteps)
         energy.passes += poses.shape[0] * count
         errors = self.prior.denoising_error(

@@ -150,8 +150,8 @@ def unet_modules(config: Mapping[str, Any]) -> dict[str, str]:
     and a downsampling; going up, one more residual block, with the upsampling inside the last one."""
     names, layers = dict(UNET_ENDS), config["layers_per_block"]
 
-    def resnet(original: str, ours: str) -> None:
-        names.update({f"{original}.{inner}": f"{ours}.{its}" for inner, its in RESNET.items()})
+    def resnet(original: str, renamed: str) -> None:
+        names.update({f"{original}.{old}": f"{renamed}.{new}" for old, new in RESNET.items()})
 
     resnet("middle_block.0", "mid_block.resnets.0")
     names["middle_block.1"] = "mid_block.attentions.0"
@@ -159,10 +159,10 @@ def unet_modules(config: Mapping[str, Any]) -> dict[str, str]:
     for level, up in enumerate(config["up_block_types"]):
         number = level * (layers + 1)
         # The first of all input blocks is conv_in.
-        for blocks, first, way, count in (("input", number + 1, "down", layers), ("output", number, "up", layers + 1)):
+        for blocks, first, path, count in (("input", number + 1, "down", layers), ("output", number, "up", layers + 1)):
             for layer in range(count):
-                resnet(f"{blocks}_blocks.{first + layer}.0", f"{way}_blocks.{level}.resnets.{layer}")
-                names[f"{blocks}_blocks.{first + layer}.1"] = f"{way}_blocks.{level}.attentions.{layer}"
+                resnet(f"{blocks}_blocks.{first + layer}.0", f"{path}_blocks.{level}.resnets.{layer}")
+                names[f"{blocks}_blocks.{first + layer}.1"] = f"{path}_blocks.{level}.attentions.{layer}"
         names[f"input_blocks.{number + 1 + layers}.0.op"] = f"down_blocks.{level}.downsamplers.0.conv"
         after = 2 if up.startswith("CrossAttn") else 1  # after the residual block and, if present, attention
         names[f"output_blocks.{number + layers}.{after}.conv"] = f"up_blocks.{level}.upsamplers.0.conv"
@@ -173,23 +173,23 @@ def vae_modules(config: Mapping[str, Any]) -> dict[str, str]:
     """Table of the autoencoder; the training code counts the decoder's levels in reverse."""
     names: dict[str, str] = {}
     levels, layers = len(config["block_out_channels"]), config["layers_per_block"]
-    for side, way, resnets in (("encoder", "down", layers), ("decoder", "up", layers + 1)):
+    for side, path, resnets in (("encoder", "down", layers), ("decoder", "up", layers + 1)):
         names[f"{side}.norm_out"] = f"{side}.conv_norm_out"
-        names |= {f"{side}.{original}": f"{side}.{ours}" for original, ours in VAE_MIDDLE.items()}
+        names |= {f"{side}.{old}": f"{side}.{new}" for old, new in VAE_MIDDLE.items()}
         for level in range(levels):
-            original = f"{side}.{way}.{level}"
-            ours = f"{side}.{way}_blocks.{level if way == 'down' else levels - 1 - level}"
-            names[f"{original}.{way}sample"] = f"{ours}.{way}samplers.0"
+            original = f"{side}.{path}.{level}"
+            renamed = f"{side}.{path}_blocks.{level if path == 'down' else levels - 1 - level}"
+            names[f"{original}.{path}sample"] = f"{renamed}.{path}samplers.0"
             for layer in range(resnets):
-                names[f"{original}.block.{layer}"] = f"{ours}.resnets.{layer}"
-                names[f"{original}.block.{layer}.nin_shortcut"] = f"{ours}.resnets.{layer}.conv_shortcut"
+                names[f"{original}.block.{layer}"] = f"{renamed}.resnets.{layer}"
+                names[f"{original}.block.{layer}.nin_shortcut"] = f"{renamed}.resnets.{layer}.conv_shortcut"
     return names
 
 
 def clip_modules(config: Mapping[str, Any]) -> dict[str, str]:
-    """Table of CLIP's image encoder; queries, keys and values are one module in OpenAI's code and three in ours."""
-    names = {original: f"vision_model.{ours}" for original, ours in CLIP_ENDS.items()}
+    """Table of CLIP's image encoder; queries, keys and values are one module in OpenAI's code, three here."""
+    names = {old: f"vision_model.{new}" for old, new in CLIP_ENDS.items()}
     for layer in range(config["num_hidden_layers"]):
-        original, ours = f"transformer.resblocks.{layer}", f"vision_model.encoder.layers.{layer}"
-        names |= {f"{original}.{inner}": f"{ours}.{its}" for inner, its in CLIP_LAYER.items()}
+        original, renamed = f"transformer.resblocks.{layer}", f"vision_model.encoder.layers.{layer}"
+        names |= {f"{original}.{old}": f"{renamed}.{new}" for old, new in CLIP_LAYER.items()}
     return names
