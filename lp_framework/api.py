@@ -25,7 +25,7 @@ from lp_framework.solvers.base import Solution, Solver, ViewSets
 from lp_framework.solvers.progress import shown_progress
 from lp_framework.solvers.starts import Starts
 
-TINY_KNOWS = (
+TINY_WARNING = (
     "prior=tiny, which ships, supports only the twelve embedded objects, uncropped; other poses are meaningless"
 )
 
@@ -124,7 +124,7 @@ def _components(
     if "prior" in wanted:
         parts["prior"] = prior if isinstance(prior, Prior) else load_prior(prior)
         if prior == "tiny":
-            warnings.warn(f"{TINY_KNOWS}. For photographs use load_prior('zero123xl', path=...)", stacklevel=3)
+            warnings.warn(f"{TINY_WARNING}. For photographs use load_prior('zero123xl', path=...)", stacklevel=3)
     return parts
 
 

@@ -24,7 +24,7 @@ from yaml import YAMLError
 
 from lp_framework import catalogue, registry
 from lp_framework.errors import UserError, among, nearest, one_line
-from lp_framework.overrides import values_of, with_paths_as_text
+from lp_framework.overrides import quote_paths, values_of
 from lp_framework.run_folders import HYDRA, Held, held, relative, remove_if_empty
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ OPTIONS = {
 }
 
 # Start of warnings, mostly Lightning's, that users of a command cannot or need not act on.
-OF_NO_USE = (
+IGNORED_WARNINGS = (
     r"The '\w+' does not have many workers",  # batches are loaded from memory, in this process
     r"Detected pickle protocol \d+ in the checkpoint",  # refused with our own message
     r"`isinstance\(treespec, LeafSpec\)` is deprecated",
@@ -48,7 +48,7 @@ OF_NO_USE = (
     r"Total length of `DataLoader` across ranks is zero",  # a resumed evaluation that only lacks its tables
 )
 
-SLIP = 0.9  # similarity ratio above which a name is a misspelt known one: max_epoch, but not min_epochs
+TYPO_RATIO = 0.9  # similarity ratio above which a name is a misspelt known one: max_epoch, but not min_epochs
 
 
 class UsageError(UserError):
@@ -64,7 +64,7 @@ def run(command: str, arguments: Sequence[str]) -> None:
     sweep the other jobs run first.
     """
     overrides, options = _parse(arguments)
-    overrides = _with_trainer_arguments(with_paths_as_text(command, overrides))
+    overrides = _with_trainer_arguments(quote_paths(command, overrides))
     registry.discover(catalogue.plugin_folders(overrides))
     for source, failure in registry.failures().items():
         print(f"warning: plugin {source} could not be loaded: {failure}", file=sys.stderr)
@@ -112,7 +112,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             try:
                 _check_paths(config)  # before the heavy imports, which take seconds
                 module = importlib.import_module(f"lp_framework.commands.{command}")
-                with _orderly_console(), held(relative(Path(config.get("resume") or folder))):
+                with _quiet_console(), held(relative(Path(config.get("resume") or folder))):
                     module.run(config)
             except (UserError, errors.InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
@@ -185,7 +185,7 @@ def _restored() -> Iterator[None]:
 
 
 @contextmanager
-def _orderly_console() -> Iterator[None]:
+def _quiet_console() -> Iterator[None]:
     """Send Lightning's messages only to the run's log, and warnings to the log and, one line each, to the console."""
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         notes = logging.getLogger(name)
@@ -194,7 +194,7 @@ def _orderly_console() -> Iterator[None]:
     logging.getLogger("huggingface_hub").propagate = False  # it prints its own messages; avoid duplicates
     logging.raiseExceptions = False  # on a full disk, drop log lines without printing tracebacks
     with warnings.catch_warnings():
-        for beginning in OF_NO_USE:
+        for beginning in IGNORED_WARNINGS:
             warnings.filterwarnings("ignore", beginning)
         warnings.showwarning = lambda message, *_, **__: log.warning("%s", " ".join(str(message).split()))
         yield
@@ -254,7 +254,7 @@ def _with_trainer_arguments(overrides: Sequence[str]) -> list[str]:
 
     def is_other(override: str) -> bool:
         group, _, name = override.partition("=")[0].partition(".")
-        return group == "trainer" and name.isidentifier() and name not in known and not nearest(name, known, SLIP)
+        return group == "trainer" and name.isidentifier() and name not in known and not nearest(name, known, TYPO_RATIO)
 
     return [f"+{override}" if is_other(override) else override for override in overrides]
 
@@ -290,9 +290,9 @@ def explain(error: Exception) -> str:
             quoted = f"text with special characters as \"{key}='{value}'\", a list as {key}=[A,B]"
             return f"cannot read '{error.override}': write {quoted if equals else 'KEY=VALUE'}"
         case HydraException() if isinstance(cause, errors.ConfigKeyError | errors.ConfigAttributeError):
-            return _place(error) + _unknown_key(cause)
+            return _location(error) + _unknown_key(cause)
         case HydraException() if isinstance(cause, errors.OmegaConfBaseException):
-            return _place(error) + (f"{cause.full_key}: " if cause.full_key else "") + one_line(cause)
+            return _location(error) + (f"{cause.full_key}: " if cause.full_key else "") + one_line(cause)
         case HydraException() if str(error).startswith("Ambiguous value for argument"):
             override = str(error).split("'")[1]
             key, _, values = override.partition("=")
@@ -303,7 +303,7 @@ def explain(error: Exception) -> str:
     return one_line(error) or type(error).__name__
 
 
-def _place(error: Exception) -> str:
+def _location(error: Exception) -> str:
     """`"In 'experiment/paper': "` if Hydra reports that an error is in a file."""
     place, colon, _ = str(error).partition(": ")
     return place + colon if place.startswith("In '") else ""

@@ -17,14 +17,14 @@ PATHS = re.compile(
     r"(images?|masks|checkpoint|resume|path|output|runs|plugins|data\.views|hydra\.(run|sweep)\.dir"
     r"|data\.objects(?==\[)|[^=]+\.(path|labels|renderings|cache))="
 )
-PLAIN = re.compile(r"[\w./:@%+*?|-]+", re.ASCII)  # plain text for Hydra, unless it matches the following
-OTHER_THAN_TEXT = re.compile(r"[-+]?[\d_]*\.?[\d_]+(e[-+]?\d+)?|[-+]?(inf|nan)|true|false", re.IGNORECASE)
+PLAIN_TEXT = re.compile(r"[\w./:@%+*?|-]+", re.ASCII)  # plain text for Hydra, unless it matches the following
+NUMBER_OR_BOOL = re.compile(r"[-+]?[\d_]*\.?[\d_]+(e[-+]?\d+)?|[-+]?(inf|nan)|true|false", re.IGNORECASE)
 # Values to leave to Hydra: empty, quoted text, a function, an interpolation.
-HYDRAS_OWN = re.compile(r"null|\?\?\?|['\"].*|(choice|range|glob|interval|sort|shuffle|str)\(.*\)|.*\$\{.*", re.DOTALL)
+HYDRA_ONLY = re.compile(r"null|\?\?\?|['\"].*|(choice|range|glob|interval|sort|shuffle|str)\(.*\)|.*\$\{.*", re.DOTALL)
 PLAIN_ARGUMENTS = {"estimate": "images"}  # the setting for arguments without a key
 
 
-def with_paths_as_text(command: str, overrides: Sequence[str]) -> list[str]:
+def quote_paths(command: str, overrides: Sequence[str]) -> list[str]:
     """Quote the paths in overrides where Hydra needs it, and turn arguments without a key into a setting.
 
     `lp estimate "IMG (1).png" b.png` becomes `images=['IMG (1).png',b.png]`.
@@ -49,7 +49,7 @@ def values_of(overrides: Iterable[str]) -> dict[str, str]:
 
 def _as_text(override: str) -> str:
     key, equals, value = override.partition("=")
-    if not equals or not PATHS.match(override.lstrip("+")) or HYDRAS_OWN.fullmatch(value):
+    if not equals or not PATHS.match(override.lstrip("+")) or HYDRA_ONLY.fullmatch(value):
         return override
     inside = value[1:-1] if value[:1] == "[" and value[-1:] == "]" else value
     if any(quote in inside for quote in "'\"") and "," in inside:
@@ -62,9 +62,9 @@ def _as_text(override: str) -> str:
 def _quoted(path: str) -> str:
     """Quote a path so that Hydra reads it as text; expands a leading `~` to the home folder."""
     path = os.path.expanduser(path)
-    if not path or HYDRAS_OWN.fullmatch(path):
+    if not path or HYDRA_ONLY.fullmatch(path):
         return path
-    if PLAIN.fullmatch(path) and not OTHER_THAN_TEXT.fullmatch(path):
+    if PLAIN_TEXT.fullmatch(path) and not NUMBER_OR_BOOL.fullmatch(path):
         return path
     escaped = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), path)
     return f"'{escaped}'"

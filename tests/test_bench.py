@@ -16,9 +16,9 @@ from view_folders import write_objects
 
 from lp_framework import registry
 from lp_framework.benchmarks import batches, harness, rendering, zero123
-from lp_framework.benchmarks.batches import loss_on
+from lp_framework.benchmarks.batches import training_loss
 from lp_framework.benchmarks.harness import Section, peak_bytes
-from lp_framework.benchmarks.stages import all_pairs, followed, plain_loop, some_pairs
+from lp_framework.benchmarks.stages import all_pairs, plain_loop, probe_energies, some_pairs
 from lp_framework.benchmarks.zero123 import (
     TIMESTEP,
     Computing,
@@ -224,7 +224,7 @@ def test_contenders_take_turns_after_a_warm_up(monkeypatch):
     monkeypatch.setattr(harness, "timed", lambda work, device: (next(seconds), work()))
 
     def work(name, amount):
-        return harness.worth(amount, lambda: done.append(name))
+        return harness.work_of(amount, lambda: done.append(name))
 
     race = section()
     race.race({"a second": (work("a", 8), work("b", 4))}, 2, rate=True)
@@ -279,8 +279,8 @@ def test_training_on_features_kept_is_training_on_both_images_of_every_pair(view
         with torch.no_grad():
             features = pose_model.backbone.trunk(batch.images)
         features = pose_model.backbone.head(features)
-        losses.append(loss_on(pose_model, batch, features))
-        torch.testing.assert_close(losses[-1], loss_on(pose_model, batch))
+        losses.append(training_loss(pose_model, batch, features))
+        torch.testing.assert_close(losses[-1], training_loss(pose_model, batch))
     whole, apart = losses[0], torch.stack(losses[1:]).mean()
     torch.testing.assert_close(whole, apart)
     parameters = [*pose_model.network.parameters()]
@@ -321,13 +321,13 @@ def test_a_descent_is_followed_on_a_probe_of_its_own():
     pairs, true = exact_pairs(3)
     starts, prior = around(true, 0.3, -0.4), ExactPrior()
     newton = GaussNewton(ExactModel(), prior, refinement_steps=4, trajectory=True)
-    energies, passes = followed(prior, pairs, newton.refine(pairs, starts, seed=0), looks=1)
+    energies, passes = probe_energies(prior, pairs, newton.refine(pairs, starts, seed=0), extra_steps=1)
     energy = PairEnergy(prior, pairs, seed=0)  # this prior's energy does not depend on the noise
     expected = energy(starts, 100, energy.noise(0)[:, 0]).mean().item()
     assert energies[0] == pytest.approx(expected) and len(energies) == len(passes) == 5
     assert passes == pytest.approx([8, 16, 24, 32, 40])  # two directions, plainly and along three numbers
     adam = TwoStage(ExactModel(), prior, refinement_steps=4, trajectory=True).second
-    _, passes = followed(prior, pairs, adam.solve(pairs, starts, seed=0), looks=0)
+    _, passes = probe_energies(prior, pairs, adam.solve(pairs, starts, seed=0), extra_steps=0)
     assert passes == pytest.approx([0, 2, 4, 6, 8])
 
 

@@ -8,12 +8,12 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from lp_framework.errors import UserError
-from lp_framework.overrides import with_paths_as_text
+from lp_framework.overrides import quote_paths
 
 
 def read(command: str, *overrides: str) -> dict[str, object]:
     """What Hydra makes of a command line."""
-    parsed = OverridesParser.create().parse_overrides(with_paths_as_text(command, overrides))
+    parsed = OverridesParser.create().parse_overrides(quote_paths(command, overrides))
     return {each.key_or_group: each.value() for each in parsed}
 
 
@@ -39,13 +39,13 @@ def test_lists_functions_interpolations_and_quotes():
     assert read("eval", "plugins=/a/b", "seed=20240101") == {"plugins": ["/a/b"], "seed": 20240101}
     assert read("eval", "data.objects=[42, IMG (1),mug]") == {"data.objects": ["42", "IMG (1)", "mug"]}
     assert read("eval", "data.objects=500") == {"data.objects": 500}  # of procedural objects their number
-    assert with_paths_as_text("eval", ["checkpoint=runs/a,20240101"]) == ["checkpoint=runs/a,'20240101'"]
-    assert with_paths_as_text("eval", ["checkpoint=choice(a,b)"]) == ["checkpoint=choice(a,b)"]
+    assert quote_paths("eval", ["checkpoint=runs/a,20240101"]) == ["checkpoint=runs/a,'20240101'"]
+    assert quote_paths("eval", ["checkpoint=choice(a,b)"]) == ["checkpoint=choice(a,b)"]
 
 
 def test_images_of_estimate_need_no_key():
     assert read("estimate", "IMG (1).png", "seed=1", "b.png") == {"images": ["IMG (1).png", "b.png"], "seed": 1}
     assert read("estimate", "20240101") == {"images": "20240101"}
     with pytest.raises(UserError, match=r"give the images either as images=\.\.\. or as arguments without a key"):
-        with_paths_as_text("estimate", ["a.png", "images=b"])
-    assert with_paths_as_text("eval", ["a.png"]) == ["a.png"]
+        quote_paths("estimate", ["a.png", "images=b"])
+    assert quote_paths("eval", ["a.png"]) == ["a.png"]

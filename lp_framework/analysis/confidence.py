@@ -21,7 +21,7 @@ TIMESTEPS, NOISES = range(50, 1000, 100), 2  # in thousandths of the prior's tim
 FAMILIAR, STRANGE = 2.0, 3.0  # multiples of the usual error: upper limits for `trust` and `doubtful`
 NEAR_DEGREES = 30.0  # of `Solution.probability`
 TRUST, DOUBT = 0.8, 0.5  # lowest probabilities for `trust` and for `doubtful`
-WORTH_TELLING = 0.05  # lowest probability at which a second answer is reported
+SECOND_ANSWER = 0.05  # lowest probability at which a second answer is reported
 
 
 class Answer(NamedTuple):
@@ -81,7 +81,7 @@ def answers(solution: Solution | None) -> list[Answer]:
         angles = torch.hypot(poses[:, 0] - poses[first, 0], wrap_angle(poses[:, 1] - poses[first, 1]))
         apart = angles > math.radians(2 * NEAR_DEGREES)
         other = int(shares.masked_fill(~apart, -1.0).nan_to_num(nan=-1.0).argmax())
-        second = _answer(poses[other], shares[other]) if apart[other] and shares[other] >= WORTH_TELLING else None
+        second = _answer(poses[other], shares[other]) if apart[other] and shares[other] >= SECOND_ANSWER else None
         found.append(_answer(poses[first], shares[first])._replace(second=second))
     return found
 

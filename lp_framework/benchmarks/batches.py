@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Section, Work, worth
+from lp_framework.benchmarks.harness import Section, Work, work_of
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairBatch
 from lp_framework.models.pose_model import DenoisingModel
@@ -29,7 +29,7 @@ def measure_loading(section: Section, data: PairDataModule, new_model: Denoising
             for _ in range(steps):
                 batch = next(batches)
                 optimizer.zero_grad()
-                loss_on(new_model, batch.to(section.device)).backward()
+                training_loss(new_model, batch.to(section.device)).backward()
                 optimizer.step()
                 done += len(batch)
             return done
@@ -63,11 +63,11 @@ def measure_encoding(
 
     def train(batch: PairBatch, trunk: Callable[[], Tensor]) -> None:
         optimizer.zero_grad()
-        loss_on(new_model, batch.to(section.device), head(trunk())).backward()
+        training_loss(new_model, batch.to(section.device), head(trunk())).backward()
         optimizer.step()
 
     def encoding(encoder: Callable[[Tensor], Any]) -> tuple[Work, Work]:
-        first, second = (worth(len(batch), partial(encoded, encoder, batch)) for batch in (once, plain))
+        first, second = (work_of(len(batch), partial(encoded, encoder, batch)) for batch in (once, plain))
         return first, second
 
     trunk = new_model.backbone.trunk
@@ -77,8 +77,8 @@ def measure_encoding(
         "pairs per second, backbone": encoding(new_model.encode),
         "pairs per second, prior": encoding(prior.encode),
         "pairs per second, training on a frozen backbone": (
-            worth(len(once), lambda: train(once, lambda: kept)),
-            worth(len(plain), lambda: train(plain, lambda: encoded(trunk, plain))),
+            work_of(len(once), lambda: train(once, lambda: kept)),
+            work_of(len(plain), lambda: train(plain, lambda: encoded(trunk, plain))),
         ),
     }
     section.race(works, rounds, rate=True)
@@ -95,10 +95,10 @@ def plain_pairs(data: PairDataModule) -> Iterator[PairBatch]:
     views, random = data.data("train"), np.random.default_rng(0)
     everything = views.table.pairs()
     while True:
-        yield two_images_a_pair(views[everything[random.choice(len(everything), data.batch_pairs, replace=False)]])
+        yield two_images_per_pair(views[everything[random.choice(len(everything), data.batch_pairs, replace=False)]])
 
 
-def two_images_a_pair(batch: PairBatch) -> PairBatch:
+def two_images_per_pair(batch: PairBatch) -> PairBatch:
     """Copy the batch so that every pair has its own two images."""
     views = torch.stack([batch.reference, batch.query], dim=-1).flatten()
     own = {name: getattr(batch, name)[views] for name in ("pixels", "poses", "cameras", "objects")}
@@ -106,7 +106,7 @@ def two_images_a_pair(batch: PairBatch) -> PairBatch:
     return replace(batch, **own, names=[batch.names[view] for view in views], reference=reference, query=reference + 1)
 
 
-def loss_on(model: DenoisingModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:
+def training_loss(model: DenoisingModel, batch: PairBatch, features: Tensor | None = None) -> Tensor:
     """The training loss of a batch, from its images or, if given, from features `[I, D]` of its views."""
     if features is None:
         features = model.encode(batch.images)
@@ -127,6 +127,6 @@ def kept_for_backward(model: DenoisingModel, batch: PairBatch) -> float:
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
-        loss = loss_on(model, batch)
+        loss = training_loss(model, batch)
     loss.backward()
     return sum(storages.values()) / len(batch)

@@ -65,7 +65,7 @@ class Section:
         return {**rows, **self.facts}
 
 
-def worth(amount: float, do: Callable[[], object]) -> Work:
+def work_of(amount: float, do: Callable[[], object]) -> Work:
     """Wrap `do` as work of `amount` units."""
 
     def work() -> float:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Section, worth
+from lp_framework.benchmarks.harness import Section, work_of
 from lp_framework.data.meshes import load_scene
 from lp_framework.data.rendering.renderer import Renderer
 from lp_framework.data.toy import toy_objects
@@ -33,7 +33,7 @@ def measure(section: Section, object: str, renderer: Renderer, views: int, resol
         file = Path(folder) / f"{object}.glb"
         objects[object].load().export(file)
         once, each_time = (partial(draw, renderer, file, cameras, resolution) for draw in (drawn, drawn_one_by_one))
-        works = {f"{renderer.name}, views per second": (worth(views, once), worth(views, each_time))}
+        works = {f"{renderer.name}, views per second": (work_of(views, once), work_of(views, each_time))}
         section.race(works, rounds, rate=True)
 
 

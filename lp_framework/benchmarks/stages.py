@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lp_framework.benchmarks.harness import Section, Work, worth
+from lp_framework.benchmarks.harness import Section, Work, work_of
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.pairs import PairData
 from lp_framework.models.pose_model import PoseModel
@@ -52,7 +52,7 @@ def measure_first_stage(section: Section, model: PoseModel, views: int, starts: 
     def works(pairs: Pairs) -> tuple[Work, Work]:
         poses, amount = Ring(starts).make(pairs, seed=0), len(pairs) * starts
         loop = partial(plain_loop, solver, pairs, poses)
-        return worth(amount, partial(solver.solve, pairs, poses, 0)), worth(amount, loop)
+        return work_of(amount, partial(solver.solve, pairs, poses, 0)), work_of(amount, loop)
 
     every = all_pairs(model.backbone.image_size, max(2, views), section.device)
     one = Pairs(every.images[:2], every.reference[:1], every.query[:1], every.ids[:1])
@@ -92,8 +92,8 @@ def measure_descent(
         poses = Ring(starts).make(chosen, seed=0)
         ends = Langevin(model, gamma=(0.0, gamma, 0.0)).solve(chosen, poses, seed=0).poses
         descents = (
-            followed(prior, chosen, newton.refine(chosen, ends, 0), looks=1),
-            followed(prior, chosen, adam.solve(chosen, ends, 0), looks=0),
+            probe_energies(prior, chosen, newton.refine(chosen, ends, 0), extra_steps=1),
+            probe_energies(prior, chosen, adam.solve(chosen, ends, 0), extra_steps=0),
         )
         level = max(min(energies) for energies, _ in descents)
         steps = [next(step for step, each in enumerate(energies) if each <= level) for energies, _ in descents]
@@ -106,10 +106,10 @@ def measure_descent(
         }
 
 
-def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tuple[list[float], list[float]]:
+def probe_energies(prior: Prior, pairs: Pairs, solution: Solution, extra_steps: int) -> tuple[list[float], list[float]]:
     """Mean probe energies and cumulative network passes per start, at the start and after each step of a solution.
 
-    Before its first step, the solver spends `looks` times the passes of one step.
+    Before its first step, the solver spends `extra_steps` times the passes of one step.
     """
     path = solution.trajectory
     assert path is not None  # it was requested
@@ -119,4 +119,4 @@ def followed(prior: Prior, pairs: Pairs, solution: Solution, looks: int) -> tupl
     energies = [energy.mean(poses, timesteps, noise).mean().item() for poses in path.unbind(dim=2)]
     steps, starts = path.shape[2] - 1, path.shape[0] * path.shape[1]
     passes = (solution.cost.network_passes - len(pairs.images)) / starts  # excludes the encoding of images
-    return energies, [passes * (step + looks) / (steps + looks) for step in range(steps + 1)]
+    return energies, [passes * (step + extra_steps) / (steps + extra_steps) for step in range(steps + 1)]

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from lp_framework.benchmarks.harness import Section, Work, peak_bytes, timed, worth
+from lp_framework.benchmarks.harness import Section, Work, peak_bytes, timed, work_of
 from lp_framework.errors import UserError
 from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior, ViewCode
@@ -89,7 +89,7 @@ def encoded(prior: Prior, codes: ViewCode) -> Prior:
 
 def batched(prior: Prior, pair: Pairs, starts: Tensor, steps: int) -> Work:
     """Steps of this package's `ifusion` from starts `[1, N, 3]`, with all starts and both directions in one batch."""
-    return worth(steps, partial(IFusion(prior, steps).solve, pair, starts, 0))
+    return work_of(steps, partial(IFusion(prior, steps).solve, pair, starts, 0))
 
 
 def plain_prior(networks: Networks) -> Zero123Prior:
@@ -171,7 +171,7 @@ def measure_step(section: Section, computing: Computing, starts: Sequence[int], 
     works = {
         f"{starts_label(count)}, seconds per step": (
             batched(ready, pair, poses, steps),
-            worth(steps, partial(looped, loops[:count], steps)),
+            work_of(steps, partial(looped, loops[:count], steps)),
         )
         for count, poses in ring.items()
     }
@@ -196,7 +196,7 @@ def measure_pair(
     def plain(count: int) -> None:
         looped([PlainLoop(loop_prior, pair.images, start) for start in ring[count][0]], steps)
 
-    runs = {count: worth(1, partial(solver.solve, pair, poses, 0)) for count, poses in ring.items()}
+    runs = {count: work_of(1, partial(solver.solve, pair, poses, 0)) for count, poses in ring.items()}
     first = {count: timed(work, section.device)[0] for count, work in runs.items()}
     PlainLoop(loop_prior, pair.images, ring[starts[0]][0, 0]).step()
     section.facts["first_pair_seconds"] = first
@@ -208,7 +208,7 @@ def measure_pair(
         f"{', '.join(f'{seconds} s from {count}' for count, seconds in paper_seconds.items())}"
     )
     works = {
-        f"{starts_label(count)}, seconds per pair": (work, worth(1, partial(plain, count)))
+        f"{starts_label(count)}, seconds per pair": (work, work_of(1, partial(plain, count)))
         for count, work in runs.items()
     }
     section.race(works, rounds, warm_up=False)

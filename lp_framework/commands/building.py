@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from lp_framework import registry
-from lp_framework.api import TINY_KNOWS, best_device
+from lp_framework.api import TINY_WARNING, best_device
 from lp_framework.atomic import DiskFull
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.views import ViewSource
@@ -103,7 +103,7 @@ def warn_of_unused(components: Components) -> None:
 def warn_of_photographs(prior: Mapping[str, Any]) -> None:
     """Warn if the settings `prior` choose the bundled prior, which does not support photographs."""
     if prior["name"] == "tiny" and prior["path"] is None:
-        log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_KNOWS)
+        log.warning("%s. For photographs: solver=ifusion prior=zero123xl prior.path=FOLDER", TINY_WARNING)
 
 
 def begin(config: DictConfig) -> tuple[Path, torch.device, Components]:

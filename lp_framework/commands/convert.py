@@ -17,7 +17,7 @@ from lp_framework.report.model_card import CARD, model_card
 
 log = logging.getLogger(__name__)
 
-OF_A_CARD = ("results", "license", "hub")  # settings for models that are shared
+CARD_SETTINGS = ("results", "license", "hub")  # settings for models that are shared
 
 
 def run(config: DictConfig) -> None:
@@ -40,7 +40,7 @@ def run(config: DictConfig) -> None:
         if config.hub is not None:
             print(f"uploaded:  {upload(output, config.hub)}")
         return
-    for key in OF_A_CARD:
+    for key in CARD_SETTINGS:
         if config[key] is not None:
             raise UserError(f"{key} belongs to a training run; {run_folder} is none")
     write_folder(load_networks(config.path, config.revision, config.weights, config.dtype), output)
@@ -48,12 +48,12 @@ def run(config: DictConfig) -> None:
 
 
 def _card(run_folder: Path, config: DictConfig) -> str | None:
-    """The model card; none, with a warning, of an unfinished run for which nobody asked for one."""
-    asked = any(config[key] is not None for key in OF_A_CARD)
+    """The model card; none, with a warning, of an unfinished run for which nobody requested for one."""
+    requested = any(config[key] is not None for key in CARD_SETTINGS)
     try:
         return model_card(run_folder, config.hub or Path(config.output).name, config.license, config.results)
     except UserError as error:
-        if asked:
+        if requested:
             raise
         log.warning("%s", error)
         return None

@@ -38,7 +38,7 @@ from lp_framework.viz.maps import minima_in_words, pair_figure, surface_figure
 from lp_framework.viz.style import save_figure
 
 GRID = ("latitude_limit_degrees", "latitude_step_degrees", "longitude_step_degrees")
-OF_A_PAIR = ("reference", "query", "masks", "solver", "start")  # settings that the overview does not use
+PAIR_SETTINGS = ("reference", "query", "masks", "solver", "start")  # settings that the overview does not use
 
 
 @torch.no_grad()
@@ -88,7 +88,7 @@ def check(config: DictConfig) -> None:
     if config.object is None and config.images is None:
         given = (override.partition("=")[0] for override in HydraConfig.get().overrides.task)
         for key in given:
-            if key.partition(".")[0] in OF_A_PAIR:
+            if key.partition(".")[0] in PAIR_SETTINGS:
                 raise UserError(f"{key} is for the landscape of a pair; also give object=NAME or images=[A.png,B.png]")
     if config.object is not None and config.images is not None:
         raise UserError("give object=NAME for views of the data set or images=[A.png,B.png], not both")

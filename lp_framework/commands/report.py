@@ -14,7 +14,7 @@ from lp_framework.errors import UserError
 from lp_framework.report.page import PAGE, write_report_page
 from lp_framework.report.runs import find_runs, run_folders
 from lp_framework.report.sweep_figures import draw_sweep
-from lp_framework.report.sweep_tables import Objects, counted, sweep_sections, sweep_tables, terminal, write_sweeps
+from lp_framework.report.sweep_tables import Objects, metrics_note, sweep_sections, sweep_tables, terminal, write_sweeps
 
 
 def run(config: DictConfig) -> None:
@@ -31,7 +31,7 @@ def run(config: DictConfig) -> None:
         raise UserError(f"runs={', '.join(map(str, folders))}: holds no finished run to report{reason}")
     folder = run_folder()
     console = Console(width=10_000 if not Console().is_terminal else None, highlight=False)
-    console.print(f"{len(runs)} runs" + (f"; {counted(objects)}" if tables else ""))
+    console.print(f"{len(runs)} runs" + (f"; {metrics_note(objects)}" if tables else ""))
     sweeps = [draw_sweep(table, folder) for table in tables]
     for sweep in sweeps:
         console.print()

@@ -31,7 +31,7 @@ from lp_framework.report.runs import saved_config
 from lp_framework.viz.curves import save_training_picture
 
 METRICS = "metrics.csv"
-OF_TRAINING = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, not used by eval
+TRAIN_ONLY = ("batch_pairs", "block", "validation_views", "validation_objects", "seed")  # of data, not used by eval
 
 
 def run(config: DictConfig) -> None:
@@ -67,7 +67,7 @@ def run(config: DictConfig) -> None:
     model.recipe = {"model": settings["model"], "backbone": settings["backbone"]}
     if (extractor := model.extractor()) is not None:
         data.cache_features(extractor)
-    data.carries_points = model.carries_points
+    data.with_points = model.needs_points
     loggers: list[Logger] = [MetricsLogger(folder, checkpoint.get("global_step", 0))]
     loggers += chosen_logger(settings["logger"], folder)
     trainer = building.build_trainer(settings["trainer"], folder, chosen_callbacks(settings, folder), loggers)
@@ -131,7 +131,7 @@ def next_command(settings: Mapping[str, Any], folder: str) -> str:
     changed = [
         f"data.{key}={shlex.quote(str(value))}"
         for key, value in data.items()
-        if key not in ("name", *OF_TRAINING) and value != usual.get(key)
+        if key not in ("name", *TRAIN_ONLY) and value != usual.get(key)
     ]
     chosen = [] if data["name"] == "toy" else [f"data={data['name']}"]
     return " ".join(["python -m lp_framework eval", f"checkpoint={folder}", *chosen, *changed])

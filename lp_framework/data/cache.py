@@ -115,8 +115,8 @@ def decoded_views(files: Sequence[Path], size: int, folder: str | Path, crop: bo
                 yield decode(image)[None]
 
     key = content_key(files, "crops" if crop else "views", size)
-    answers = [decode(sample) for sample in sample_images()[: 1 if crop else 2]]
-    return key, cached_array(folder, answered_key(key, answers), len(files), blocks)
+    samples = [decode(sample) for sample in sample_images()[: 1 if crop else 2]]
+    return key, cached_array(folder, versioned_key(key, samples), len(files), blocks)
 
 
 def sample_images() -> list[Image.Image]:
@@ -127,10 +127,10 @@ def sample_images() -> list[Image.Image]:
     return [Image.fromarray(soft), Image.fromarray(ramp)]
 
 
-def answered_key(key: str, answers: Iterable[NDArray]) -> str:
-    """Extend `key` by a decoder's outputs for sample images, its `answers`, so that arrays decoded differently by an
+def versioned_key(key: str, samples: Iterable[NDArray]) -> str:
+    """Extend `key` by a decoder's outputs for sample images, its `samples`, so that arrays decoded differently by an
     earlier version are not used."""
-    return content_key([], key, [hashlib.blake2b(answer.tobytes(), digest_size=8).hexdigest() for answer in answers])
+    return content_key([], key, [hashlib.blake2b(sample.tobytes(), digest_size=8).hexdigest() for sample in samples])
 
 
 def pixels_on_white(image: Image.Image, size: int) -> NDArray[np.uint8]:

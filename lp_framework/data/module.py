@@ -81,9 +81,9 @@ class PairDataModule(LightningDataModule):
         self.image_size, self.batch_pairs, self.block = image_size, batch_pairs, block
         self.photographs, self.crop = photographs, crop
         self.validation_views, self.validation_objects, self.seed = validation_views, validation_objects, seed
-        self.carries_points = False  # whether training batches have the 3-D points given by the depths
+        self.with_points = False  # whether training batches have the 3-D points given by the depths
         self._extractor: FeatureExtractor | None = None
-        self._answer: list[str] = []  # digest of its output
+        self._output_digest: list[str] = []  # digest of its output
         self._evaluation: tuple[str, int] | None = None  # protocol and seed
         self._views: int | None = None  # images per set, if sets are evaluated
         self._evaluation_pairs = EVALUATION_PAIRS
@@ -177,7 +177,7 @@ class PairDataModule(LightningDataModule):
 
     def cache_features(self, extractor: FeatureExtractor) -> None:
         """Make batches carry the features of a frozen backbone, computed once, instead of images."""
-        self._extractor, self._answer = extractor, _answer(extractor, self.image_size)
+        self._extractor, self._output_digest = extractor, _output_digest(extractor, self.image_size)
 
     def data(self, split: str) -> PairData:
         """The batches of a split, indexed by pairs."""
@@ -185,7 +185,7 @@ class PairDataModule(LightningDataModule):
         # Training and validation views share one array, so that a different division needs no new decoding.
         files = [file for views in self._on_disk(split) for file in views.files]
         crop = self.crop and split in ("test", "all_train")
-        if _folder(split) == "train" and (self.photographs or self.carries_points):
+        if _folder(split) == "train" and (self.photographs or self.with_points):
             key, views = decoded_renderings(self._on_disk(split), self.photographs, self.image_size, self.cache)
             arrays = {"images": views["pixels"], "points": views["points"], "cropped": views["cropped"]}
         else:
@@ -195,7 +195,7 @@ class PairDataModule(LightningDataModule):
         if (extractor := self._extractor) is not None:
             # Keyed by the file of decoded views, whose name identifies how they were decoded.
             feature_key = content_key(
-                [], "features", Path(str(views.filename)).stem, extractor.fingerprint(), self._answer
+                [], "features", Path(str(views.filename)).stem, extractor.fingerprint(), self._output_digest
             )
             device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
             arrays["features"] = cached_array(
@@ -242,7 +242,7 @@ def _folder(split: str) -> str:
     return "test" if split == "test" else "train"
 
 
-def _answer(extractor: FeatureExtractor, size: int) -> list[str]:
+def _output_digest(extractor: FeatureExtractor, size: int) -> list[str]:
     """A coarse digest of the extractor's output for one image; changes with its code and settings, not the machine."""
     image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     with torch.inference_mode():

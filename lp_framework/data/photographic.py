@@ -18,7 +18,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
-from lp_framework.data.cache import answered_key, cached_array, pixels_on_white, sample_images, tracked
+from lp_framework.data.cache import cached_array, pixels_on_white, sample_images, tracked, versioned_key
 from lp_framework.data.files import content_key
 from lp_framework.data.images import eight_bit
 from lp_framework.data.photographs import EXTENT, SIZE, opened
@@ -136,8 +136,8 @@ def decoded_renderings(
     seen_from = [(each.name, each.cameras.tolist(), each.field_of_view.tolist()) for each in views]
     key = content_key([*files, *depths], "renderings by object", share, size, CELLS, seen_from)
     soft, deep = sample_images()
-    answers = [decode(soft, deep, np.eye(4), 1.0, each) for each in (None, np.random.default_rng(0))]
-    return key, cached_array(folder, answered_key(key, answers), len(files), blocks)
+    samples = [decode(soft, deep, np.eye(4), 1.0, each) for each in (None, np.random.default_rng(0))]
+    return key, cached_array(folder, versioned_key(key, samples), len(files), blocks)
 
 
 def _points(levels: Image.Image, camera: NDArray, field_of_view: float) -> NDArray[np.float32]:

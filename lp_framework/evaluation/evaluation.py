@@ -90,7 +90,7 @@ class Evaluation(LightningModule):
             valid=solution.valid[:, None].expand_as(ids).reshape(-1, 1),
             chosen=torch.zeros_like(pairs.reference),
             cost=solution.cost,
-            probability=None if solution.pairs is None else _of_chosen(solution.pairs)[:, None],
+            probability=None if solution.pairs is None else _chosen_probability(solution.pairs)[:, None],
         )
 
     def test_step(self, batch: PairBatch, batch_idx: int) -> None:
@@ -103,7 +103,7 @@ class Evaluation(LightningModule):
             translation=translation.double(),
             chosen=solution.chosen.cpu(),
             answer=solution.answer().cpu().double(),
-            probability=_of_chosen(solution),
+            probability=_chosen_probability(solution),
             seconds=solution.cost.seconds,
             passes=solution.cost.network_passes,
         )
@@ -112,7 +112,7 @@ class Evaluation(LightningModule):
             self.journal.append(solved, self.global_rank)
 
 
-def _of_chosen(solution: Solution) -> Tensor:
+def _chosen_probability(solution: Solution) -> Tensor:
     """The probability of each answer `[P]`, float64 on the CPU; NaN if the model has none."""
     if solution.probability is None:
         return torch.full((len(solution.chosen),), torch.nan, dtype=torch.float64)

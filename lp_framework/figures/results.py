@@ -22,7 +22,7 @@ from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.report.runs import find_runs
 from lp_framework.report.sweep_figures import is_swept, sweep_figure
-from lp_framework.report.sweep_tables import OVER, Objects, SweepTable, sweep_tables
+from lp_framework.report.sweep_tables import LABELS, Objects, SweepTable, sweep_tables
 from lp_framework.viz.cameras import CameraScene, camera_methods_figure
 
 NAMES = {"ifusion": "iFusion", "id_pose": "ID-Pose", "two_stage": "two-stage"}  # as written in papers
@@ -125,5 +125,5 @@ class RecallFigure(PaperFigure):
         seeds = max(len(row.seeds) for row in contents.rows)
         return figure, (
             "Recall within 30 degrees (and a translation error of 0.2) for different numbers of random starts, and for "
-            f"the seconds that they take, over {OVER[self.objects]}; bars: standard deviation over {seeds} seeds."
+            f"the seconds that they take, over {LABELS[self.objects]}; bars: standard deviation over {seeds} seeds."
         )

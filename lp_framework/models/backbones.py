@@ -83,12 +83,12 @@ class Standardise(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """`[I, dim]` to `[I, dim]`; in training mode the statistics are updated with the batch first."""
         if self.training:
-            self._take_in(features.detach().float())
+            self._update(features.detach().float())
         spread = self.variance.sqrt()
         return (features - self.mean) / (spread + 0.05 * spread.mean() + 1e-6)
 
     @torch.no_grad()
-    def _take_in(self, features: Tensor) -> None:
+    def _update(self, features: Tensor) -> None:
         added = features.new_tensor([features.shape[0]])
         total, squares = features.sum(dim=0), (features - self.mean).square().sum(dim=0)
         if distributed.is_available() and distributed.is_initialized():  # all processes keep the same statistics

@@ -47,7 +47,7 @@ class MatchingModel(PoseModel):
     """
 
     backbone: EfficientNetLite0Maps
-    has_energy, has_density, choose_by, carries_points = True, True, "energy", True
+    has_energy, has_density, choose_by, needs_points = True, True, "energy", True
 
     def __init__(
         self,
@@ -151,7 +151,7 @@ class MatchingModel(PoseModel):
         return result
 
     def training_step(self, batch: PairBatch, batch_idx: int) -> Tensor:
-        assert batch.cropped is not None  # because of `carries_points`
+        assert batch.cropped is not None  # because of `needs_points`
         random = self._generator()
         maps, points, poses = self._mirrored(batch, random)
         features, coverage, cells = self._foremost(maps, self.training_cells, random)

@@ -23,7 +23,7 @@ class TrainedModule(LightningModule):
 
     recipe: Mapping[str, Any] | None = None
 
-    carries_points = False  # whether its batches include the 3-D points visible in their views
+    needs_points = False  # whether its batches include the 3-D points visible in their views
 
     def __init__(
         self,

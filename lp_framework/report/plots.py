@@ -34,7 +34,7 @@ INK, MUTED, LINE, SURFACE, HALO, TRUTH, ANSWER, OTHERS, REFERENCE, GREY = (
 WHITE, DARK = "#ffffff", "#3A3A3A"  # over a landscape, which is the same in both themes
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 12, "color": INK}
 AXIS = {"gridcolor": LINE, "linecolor": LINE, "zerolinecolor": LINE, "title": {"font": {"color": MUTED}}}
-LOOK = {
+LAYOUT = {
     "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "hovermode": "closest",
     "margin": {"l": 54, "r": 16, "t": 10, "b": 44}, "xaxis": AXIS, "yaxis": AXIS,
     "scene": {"xaxis": AXIS, "yaxis": AXIS, "zaxis": AXIS, "aspectmode": "manual", "dragmode": "turntable"},
@@ -368,7 +368,7 @@ def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
 
 
 def _figure(**layout: Any) -> go.Figure:
-    return go.Figure(layout={"template": {"layout": LOOK}, "showlegend": False, "font": FONT, **layout})
+    return go.Figure(layout={"template": {"layout": LAYOUT}, "showlegend": False, "font": FONT, **layout})
 
 
 def _scene(aspect: Sequence[float], eye: Sequence[float], below: float, **axes: Any) -> go.Figure:

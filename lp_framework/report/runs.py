@@ -22,7 +22,7 @@ from lp_framework.evaluation.tables import RESULT
 HYDRA = Path(".hydra") / "hydra.yaml"  # Hydra's record of a job: its command and its choices
 COSTS = ("seconds_per_pair", "network_passes_per_pair")
 # Settings that are not compared because they change no result. The checkpoint has `checkpoint_setting`.
-ASIDE = ("plugins", "checkpoint", "seed", "batch_pairs", "pictures", "resume")
+IGNORED_SETTINGS = ("plugins", "checkpoint", "seed", "batch_pairs", "pictures", "resume")
 Kind = Literal["eval", "train", "estimate", "landscape"]  # the commands whose runs have a page
 # Without a Hydra folder, the first of these files that exists identifies the command.
 FILES: dict[str, Kind] = {
@@ -122,7 +122,7 @@ def settings(config: Mapping[str, Any]) -> dict[str, Any]:
     >>> settings({"seed": 1, "data": {"name": "toy", "seed": 1}, "solver": {"gamma": 0.3}})
     {'data.name': 'toy', 'solver.gamma': 0.3}
     """
-    values = {key: _number(value) for key, value in dotted(config).items() if key not in ASIDE}
+    values = {key: _number(value) for key, value in dotted(config).items() if key not in IGNORED_SETTINGS}
     return {key: value for key, value in values.items() if not key.endswith(".seed")}
 
 

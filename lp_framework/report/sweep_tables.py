@@ -24,7 +24,7 @@ Objects = Literal["unique_answer", "all"]
 METRICS = [*COLUMNS, *ERRORS, *COSTS]
 PRINTED = [f"{prefix}{degrees}" for degrees in ROTATION_THRESHOLDS for prefix in ("R@", "R(R)@")]
 PRINTED += [f"S{name}" for name in PRINTED] + [*ERRORS, *COSTS]  # in the paper's order
-OVER: dict[Objects, str] = {"unique_answer": "objects with a unique answer", "all": "all objects"}
+LABELS: dict[Objects, str] = {"unique_answer": "objects with a unique answer", "all": "all objects"}
 
 
 @dataclass(frozen=True)
@@ -288,9 +288,9 @@ class Sweep(NamedTuple):
         return [file for file in self.files if file.suffix == ".png"]
 
 
-def counted(objects: Objects) -> str:
+def metrics_note(objects: Objects) -> str:
     """What the metrics are over, in words."""
-    return f"metrics over {OVER[objects]}; mean and standard deviation over seeds"
+    return f"metrics over {LABELS[objects]}; mean and standard deviation over seeds"
 
 
 def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> dict[str, str]:
@@ -304,7 +304,7 @@ def write_sweeps(
 ) -> None:
     """Write `report.md`, `report.csv` (one row per combination) and `report.json` (with `about`) into `folder`."""
     write_csv(folder / "report.csv", *csv_rows([sweep.table for sweep in sweeps]))
-    text = render("report.md.j2", sweeps=sweeps, left_out=left_out, counted=counted(objects))
+    text = render("report.md.j2", sweeps=sweeps, left_out=left_out, metrics_note=metrics_note(objects))
     write_text(folder / "report.md", text)
     tables = [{**asdict(sweep.table), "figures": [file.name for file in sweep.files]} for sweep in sweeps]
     missing = [{"folder": str(path), "reason": reason} for path, reason in left_out]

@@ -72,7 +72,7 @@ class Plateau:
 Energy = Callable[[Tensor, int], Tensor]  # (poses [B, N, P], step) -> energies [B, N]
 
 
-class Descended(NamedTuple):
+class Descent(NamedTuple):
     """`trajectory` `[B, N, steps + 1, P]` from start to final pose; `total` `[B, N]`, the sum of the energies along it;
     `valid` `[B, N]`."""
 
@@ -88,7 +88,7 @@ def descend(
     steps: int,
     optimizer: GradientDescent,
     plateau: Plateau | None = None,
-) -> Descended:
+) -> Descent:
     """Minimize `energy(pose_of(parameters), step)` for `steps` steps from parameters `[B, N, D]`.
 
     The plateau schedule gets the sum of the energies so far, as in iFusion. A start whose energy or gradient becomes
@@ -115,7 +115,7 @@ def descend(
     pose = pose_of(parameters)
     finite = pose.isfinite().all(dim=-1)
     trajectory.append(torch.where(finite[..., None], pose, place))
-    return Descended(torch.stack(trajectory, dim=2), total, valid & finite)
+    return Descent(torch.stack(trajectory, dim=2), total, valid & finite)
 
 
 def unwrapped(trajectory: Tensor) -> Tensor:

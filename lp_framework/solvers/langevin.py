@@ -64,7 +64,7 @@ class Langevin(Solver):
         self.model = model
         self.alpha, self.gamma = alpha, _triple(gamma)
         self.iterations, self.choose_by, self.trajectory = iterations, choose_by or model.choose_by, trajectory
-        self.sigmas = None if sigma is None else _falling(sigma, iterations)
+        self.sigmas = None if sigma is None else _sigma_schedule(sigma, iterations)
 
     @timed
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
@@ -98,8 +98,8 @@ class Langevin(Solver):
             pose = pose + self.alpha * ratio**2 * score + ratio * noise[:, :, step]
             trajectory.append(pose)
         energies = self._energies(condition, pose)
-        looks = self.iterations + {"distance": 3, "energy": 1, "agreement": 0}[self.choose_by]
-        cost = Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * looks)
+        evaluations = self.iterations + {"distance": 3, "energy": 1, "agreement": 0}[self.choose_by]
+        cost = Cost(len(pairs.images) + starts.shape[0] * starts.shape[1] * evaluations)
         path = torch.stack(trajectory, dim=2) if self.trajectory else None
         within = self.model.probability(condition, pose)
         valid, chosen = pose.isfinite().all(dim=-1), choose(energies)
@@ -140,14 +140,14 @@ class Langevin(Solver):
         return (variance**2 * score.square().sum(dim=-1) + beyond).sqrt()
 
 
-def before_second_stage(
+def make_first_stage(
     model: PoseModel, alpha: float, gamma: float | Sequence[float], iterations: int, trajectory: bool = False
 ) -> Langevin:
     """`Langevin`, with little smoothing for models with densities so that their modes stay separate."""
     return Langevin(model, alpha, gamma, iterations, sigma=SHARP if model.has_density else None, trajectory=trajectory)
 
 
-def _falling(sigma: float | Sequence[float], steps: int) -> list[float]:
+def _sigma_schedule(sigma: float | Sequence[float], steps: int) -> list[float]:
     """`sigma` at each step."""
     ends = [sigma] * 2 if isinstance(sigma, int | float) else [*sigma]
     fits = len(ends) == 2 and all(0 < each < math.inf for each in ends)

@@ -16,7 +16,7 @@ from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, ViewSets, ViewSolution, choose, timed
-from lp_framework.solvers.langevin import before_second_stage
+from lp_framework.solvers.langevin import make_first_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.pose_graph import fit_views
 from lp_framework.solvers.twist import TwistDescent, TwistPoses
@@ -67,7 +67,7 @@ class MultiView(Solver):
         at_least(1, "solver", refinement_steps=refinement_steps)
         self.model, self.prior = model, prior
         self.first_stage, self.second_stage = first_stage, second_stage
-        self.first = before_second_stage(model, alpha, gamma, iterations)
+        self.first = make_first_stage(model, alpha, gamma, iterations)
         schedule = (refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep)
         self.second = TwistDescent(prior, *schedule, rescoring=rescoring)
 

@@ -20,7 +20,7 @@ from lp_framework.geometry import camera_to_world, se3_exp, view_pose
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose, timed
-from lp_framework.solvers.descent import Adam, Descended, Energy, Plateau, descend, unwrapped
+from lp_framework.solvers.descent import Adam, Descent, Energy, Plateau, descend, unwrapped
 from lp_framework.solvers.pair_energy import PairEnergy
 
 ChooseBy = Literal["accumulated", "rescored"]
@@ -150,7 +150,7 @@ class TwistDescent(Solver):
         """The timesteps for comparing final poses, spread over the whole schedule."""
         return [self.timestep((number + 0.5) / self.rescoring) for number in range(self.rescoring)]
 
-    def descend(self, energy: Energy, pose_of: Callable[[Tensor], Tensor], twist: Tensor) -> Descended:
+    def descend(self, energy: Energy, pose_of: Callable[[Tensor], Tensor], twist: Tensor) -> Descent:
         """Run `descent.descend` with Adam and the plateau schedule from twists `[B, N, D]`."""
         adam = Adam(twist, self.learning_rate)
         return descend(energy, pose_of, twist, self.steps, adam, Plateau(adam, self.factor, self.patience))

@@ -15,7 +15,7 @@ from lp_framework.models.pose_model import PoseModel
 from lp_framework.priors.base import Prior
 from lp_framework.registry import register
 from lp_framework.solvers.base import Cost, Pairs, Solution, Solver, choose, timed
-from lp_framework.solvers.langevin import before_second_stage
+from lp_framework.solvers.langevin import make_first_stage
 from lp_framework.solvers.pair_energy import PairEnergy
 from lp_framework.solvers.progress import steps_of
 from lp_framework.solvers.twist import ChooseBy, TanhRadius, TwistDescent
@@ -50,7 +50,7 @@ class TwoStage(Solver):
     ) -> None:
         at_least(0, "solver", refinement_steps=refinement_steps)
         self.model, self.prior = model, prior
-        self.first = before_second_stage(model, alpha, gamma, iterations, trajectory)
+        self.first = make_first_stage(model, alpha, gamma, iterations, trajectory)
         schedule = (refinement_steps, learning_rate, factor, patience, first_timestep, last_timestep)
         self.second = TwistDescent(prior, *schedule, choose_by, rescoring, trajectory=trajectory)
 
@@ -60,10 +60,10 @@ class TwoStage(Solver):
         first = self.first.solve(pairs, starts, seed)
         if self.second.steps == 0:
             return first
-        return in_a_row(first, lambda ends: self.second.solve(pairs, ends, seed))
+        return chained(first, lambda ends: self.second.solve(pairs, ends, seed))
 
 
-def in_a_row(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
+def chained(first: Solution, second: Callable[[Tensor], Solution]) -> Solution:
     """Run `second` from the final poses of `first` `[B, N, 3]`; trajectory and cost cover both stages.
 
     A start is invalid if either stage failed; if the first did, it keeps the first stage's pose.
@@ -126,7 +126,7 @@ class GaussNewton(Solver):
             ("timesteps", list(timesteps), known, f"one or more of 0 to {prior.num_timesteps - 1}"),
             ("damping", damping, 0 < damping < math.inf, "positive"),
         )
-        self.first = before_second_stage(model, alpha, gamma, iterations, trajectory)
+        self.first = make_first_stage(model, alpha, gamma, iterations, trajectory)
         self.model, self.prior = model, prior
         self.steps, self.timesteps, self.damping = refinement_steps, list(timesteps), damping
         self.trajectory = trajectory
@@ -135,7 +135,7 @@ class GaussNewton(Solver):
     def solve(self, pairs: Pairs, starts: Tensor, seed: int) -> Solution:
         """See `Solver.solve`. Energies are those minimized; a start is invalid if the model or the prior failed."""
         first = self.first.solve(pairs, starts, seed)
-        return in_a_row(first, lambda ends: self.refine(pairs, ends, seed))
+        return chained(first, lambda ends: self.refine(pairs, ends, seed))
 
     @timed
     @torch.inference_mode(False)
@@ -144,7 +144,7 @@ class GaussNewton(Solver):
         """The second stage alone, from starts `[B, N, 3]`."""
         energy = PairEnergy(self.prior, pairs, seed)
         noise = energy.noise(0, len(self.timesteps))
-        pose = _plausible(starts.clone())
+        pose = _clamped(starts.clone())
         trajectory = [pose]
         here = self._quadratic(energy, pose, noise)
         damping = self.damping * here.hessian.diagonal(dim1=-2, dim2=-1).amax(dim=-1)  # [B, N]
@@ -154,7 +154,7 @@ class GaussNewton(Solver):
             damped = here.hessian + damping[..., None, None] * identity
             solved, _ = torch.linalg.solve_ex(damped, here.gradient)
             length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)
-            proposal = _plausible(pose - solved * (LONGEST_STEP / length.clamp(min=LONGEST_STEP)))
+            proposal = _clamped(pose - solved * (LONGEST_STEP / length.clamp(min=LONGEST_STEP)))
             step = proposal - pose
             there = self._quadratic(energy, proposal, noise)
             curved = (here.hessian * step[..., None] * step[..., None, :]).sum(dim=(-2, -1))
@@ -193,6 +193,6 @@ class GaussNewton(Solver):
         return Quadratic(*(torch.stack(part).mean(dim=0) for part in zip(*parts, strict=True)))
 
 
-def _plausible(poses: Tensor) -> Tensor:
+def _clamped(poses: Tensor) -> Tensor:
     """Clamp the relative radii of poses `[..., 3]` to the range of views."""
     return torch.cat([poses[..., :2], poses[..., 2:].clamp(-TanhRadius.LIMIT, TanhRadius.LIMIT)], dim=-1)

@@ -40,7 +40,7 @@ def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
             scene = trimesh.load_scene(str(path), process=False)
     meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh)]
     for mesh in meshes:
-        _mend(path, mesh)
+        _clean(path, mesh)
     if left_out := sorted(set().union(*map(_left_out, meshes))):
         warn(path, f"not drawn of its materials: {', '.join(left_out)}")
     return scene
@@ -58,7 +58,7 @@ def read_ply(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     return load("ply", io.BytesIO(content), files, skip_materials=not files)
 
 
-def _mend(path: Path, mesh: trimesh.Trimesh) -> None:
+def _clean(path: Path, mesh: trimesh.Trimesh) -> None:
     """Remove faces with non-finite coordinates, and merge identical vertices."""
     faces = len(mesh.faces)
     if not np.isfinite(mesh.vertices).all():

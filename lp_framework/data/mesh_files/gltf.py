@@ -55,7 +55,7 @@ def read_gltf(path: Path) -> trimesh.Scene:
             file.geometry(primitive)
             file.colours(primitive)
             file.texture_coordinates(primitive, textures)
-    file.say_what_is_left_out()
+    file.warn_of_ignored()
     scene = file.scene()
     for mesh in scene.geometry.values():
         if isinstance(getattr(mesh, "visual", None), TextureVisuals):
@@ -198,7 +198,7 @@ class _File:
                     moved = {key.lower(): values for key, values in zip(keys, place, strict=True)}
                     self.header["nodes"].append({"mesh": mesh, **moved})
 
-    def say_what_is_left_out(self) -> None:
+    def warn_of_ignored(self) -> None:
         """Warn of skins and morph targets that are not applied."""
         nodes, meshes = self.header.get("nodes", []), self.header.get("meshes", [])
         if any("skin" in node for node in nodes):

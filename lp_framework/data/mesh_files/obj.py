@@ -48,7 +48,7 @@ def read_obj(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     texture's wrap modes in `metadata[WRAP]`."""
     text = _read(path)
     if re.search(r"^f[ \t].*?[ \t/]-\d", text, re.MULTILINE):
-        text = _counting_forwards(text)
+        text = _absolute_indices(text)
     if re.search(r"^v(?:[ \t]+\S+){6}", text, re.MULTILINE):  # trimesh needs a colour at every vertex
         text = re.sub(r"^(v(?:[ \t]+[^\s#]+){3})[ \t]*$", r"\1 1 1 1", text, flags=re.MULTILINE)
     libraries = _libraries(path, text, folders)
@@ -125,7 +125,7 @@ def _options(value: str) -> tuple[Mapping, str]:
     return mapping, value
 
 
-def _counting_forwards(text: str) -> str:
+def _absolute_indices(text: str) -> str:
     """Convert face indices that count back from the current line (-1 is the last) to indices from the start (1 is the
     first)."""
     counts = {"v": 0, "vt": 0, "vn": 0}

@@ -75,22 +75,22 @@ def mug(random: Generator) -> Parts:
     return parts
 
 
-def bowl(random: Generator, told: bool) -> Parts:
+def bowl(random: Generator, resolved: bool) -> Parts:
     """A bowl, a dish or a plate."""
     foot, high, flat = random.uniform(0.18, 0.4), random.uniform(0.25, 0.6), chance(random, 0.4)
     profile = outside(random, foot, random.uniform(0.4, 0.5), 0.5, high)
     if flat:
         profile = np.array([(foot, 0), (foot + 0.03, 0.3), (0.45, 0.8), (0.5, 1)]) * (1, 0.3 * high)
-    lined = told or flat or chance(random, 0.5)
-    return [(vessel(profile, 0.02, lined), scene_around(random) if told else glaze(random))]
+    lined = resolved or flat or chance(random, 0.5)
+    return [(vessel(profile, 0.02, lined), scene_around(random) if resolved else glaze(random))]
 
 
-def vase(random: Generator, told: bool) -> Parts:
+def vase(random: Generator, resolved: bool) -> Parts:
     """A vase, an urn, a candlestick or a turned wooden piece."""
     radii = random.uniform(0.12, 0.42, int(random.integers(4, 7)))
     heights = np.linspace(0, random.uniform(0.8, 1.2), len(radii))
     profile = curve(np.stack([radii, heights], axis=1), 20).clip((0.06, 0))
-    return [(vessel(profile, 0.02), scene_around(random) if told else glaze(random))]
+    return [(vessel(profile, 0.02), scene_around(random) if resolved else glaze(random))]
 
 
 def pan(random: Generator) -> Parts:

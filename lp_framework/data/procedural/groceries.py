@@ -40,9 +40,9 @@ def carton(random: Generator) -> Parts:
     return [(walls, sheet), (gable, plain(b.base)), (fin, plain(pick(random, (b.base, b.second))))]
 
 
-def bottle(random: Generator, flat: bool, told: bool = True) -> Parts:
+def bottle(random: Generator, flat: bool, resolved: bool = True) -> Parts:
     """A bottle: `flat` ones are oval, with a label in front or on both sides. Round ones have a label all the way round
-    if the longitude is `told` by it, otherwise a label in front or none."""
+    if the longitude is `resolved` by it, otherwise a label in front or none."""
     b, wide, shoulder = brand(random), *random.uniform((0.26, 0.5), (0.42, 0.74))
     neck = random.uniform(0.4, 0.7) * wide if flat else random.uniform(0.09, 0.14)
     ratio, waist = random.uniform((0.45, 0.82), (0.75, 1.0)) if flat else (1.0, 1.0)
@@ -55,10 +55,10 @@ def bottle(random: Generator, flat: bool, told: bool = True) -> Parts:
     form = body(np.stack([widths, depths, heights], axis=1), exponent, steps=steps)
     sheet = Image.new("RGB", (512, 512), ink(random, b.base))
     low, high = random.uniform((0.05, 0.85 * shoulder), (0.15, 0.98 * shoulder))
-    if told and not flat:
+    if resolved and not flat:
         roles = zip(("front", "facts", "back", "story"), random.uniform(0.5, 1.2, 4), strict=True)
         around([panel(random, b, role, width, 1) for role, width in roles], low, high, sheet)
-    elif told or chance(random, 0.5):
+    elif resolved or chance(random, 0.5):
         front, back = (panel(random, b, role, 0.9 * wide, high - low) for role in ("front", "back"))
         stick(front, 0.5, low, high, 0.34, sheet, elliptic=chance(random, 0.3))
         if flat and chance(random, 0.5):
@@ -67,8 +67,8 @@ def bottle(random: Generator, flat: bool, told: bool = True) -> Parts:
     return [(form, sheet), (cap.move(y=0.94), plain(colour(random)))]
 
 
-def tin(random: Generator, told: bool, exponent: float = 2.0) -> Parts:
-    """A can, jar, tub or canister; its label goes all the way round if the longitude is `told` by it."""
+def tin(random: Generator, resolved: bool, exponent: float = 2.0) -> Parts:
+    """A can, jar, tub or canister; its label goes all the way round if the longitude is `resolved` by it."""
     kind = pick(random, ("can", "can", "jar", "tub", "drum"))
     high = {"can": random.uniform(0.35, 1.4), "jar": 1.2, "tub": random.uniform(0.5, 1), "drum": 1.7}[kind]
     foot, top = random.uniform(0.7, 0.85) if kind == "tub" else 1.0, 0.85 if kind == "jar" else 1.0
@@ -79,7 +79,7 @@ def tin(random: Generator, told: bool, exponent: float = 2.0) -> Parts:
     if kind == "jar":
         heap(random, sheet, colour(random))
     start, stop = (0.15, 0.75) if kind == "jar" else (0.03, 0.88)
-    if told:
+    if resolved:
         roles = zip(("front", "facts", "back", "story"), random.uniform(0.6, 1.0, 4), strict=True)
         around([panel(random, b, role, width, high * (stop - start)) for role, width in roles], start, stop, sheet)
     else:  # glazed in one colour, or with a horizontal band

@@ -39,9 +39,9 @@ class Replayed:
 
     def forget(self) -> bool:
         """Free the recordings and record again at the next call; returns whether there were any."""
-        any_there = bool(self.recordings)
+        had_any = bool(self.recordings)
         self.recordings.clear()
-        return any_there
+        return had_any
 
     def _pool(self) -> Any:
         """The memory pool shared by all recordings; after a replay, nothing but its copied results is needed."""
@@ -67,7 +67,7 @@ class Recording:
             torch.cuda.current_stream().wait_stream(stream)
             # Thread-local errors, because a data loader's thread may pin memory during capture.
             with (
-                _workspaces_of_its_own(),
+                _own_workspaces(),
                 torch.cuda.graph(self.graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
             ):
                 self.outputs = function(*self.inputs)
@@ -80,7 +80,7 @@ class Recording:
 
 
 @contextmanager
-def _workspaces_of_its_own() -> Iterator[None]:
+def _own_workspaces() -> Iterator[None]:
     """Allocate cuBLAS workspaces from the recording's memory and share them with no other recording.
 
     Otherwise PyTorch reuses them for the next recording on the stream and frees them with the first one. There is no

@@ -24,7 +24,7 @@ UNET, VAE, CLIP, PROJECTION = "model.diffusion_model.", "first_stage_model.", "c
 EMA = "model_ema."
 VISUAL = f"{CLIP}model.visual."
 # Other allowed contents of a checkpoint: the schedule's tables, CLIP's text half, the autoencoder's training loss.
-LEFT_OVER = re.compile(
+IGNORED = re.compile(
     r"betas|(sqrt_|log_)?(one_minus_|recip_|recipm1_)?alphas_cumprod(_prev)?|posterior_\w+|logvar|scale_factor|"
     r"lvlb_weights|model_ema\..*|cond_stage_model\.(?!model\.visual\.).*|first_stage_model\.loss\..*"
 )
@@ -60,7 +60,7 @@ def read_original(path: Path, weights: Averages) -> tuple[Configs, Weights]:
     `UserError` if the file is not a Zero123 checkpoint."""
     tensors = read_state_dict(path)
     for key in tensors:
-        if not key.startswith((UNET, VAE, VISUAL, PROJECTION)) and not LEFT_OVER.fullmatch(key):
+        if not key.startswith((UNET, VAE, VISUAL, PROJECTION)) and not IGNORED.fullmatch(key):
             raise UserError(f"{path}: is not a Zero123 checkpoint: it holds an unknown tensor '{key}'")
     if weights == "ema" and not any(key.startswith(EMA) for key in tensors):
         raise UserError(f"{path}: holds no moving averages ({EMA}...); use the raw weights with weights=raw")

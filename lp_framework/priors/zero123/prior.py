@@ -20,7 +20,7 @@ from lp_framework.priors.zero123.weights import load_networks
 from lp_framework.registry import register
 
 IMAGE_SIZE = 256  # some configs of published folders have the sizes of Stable Diffusion instead
-STEEPER = 4096  # loss scale that prevents small gradients from vanishing in float16; a power of two is exact
+GRAD_SCALE = 4096  # prevents small gradients from vanishing in float16; a power of two is exact
 SCALE = 0.18215  # factor on latents before noise is added; the latent of the source is not scaled
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
@@ -70,14 +70,14 @@ class Chunks:
         return results
 
 
-class EnergyAndSlope(torch.autograd.Function):
+class StoredGradient(torch.autograd.Function):
     """Energies `[B]` of poses `[B, 3]`, each depending only on its own pose. `both` also computes the gradients, chunk
     by chunk, and these are stored instead of activations. Differentiable once; for higher orders use the residual."""
 
     @staticmethod
     def forward(pose: Tensor, both: Callable[[slice], tuple[Tensor, Tensor]], chunks: Chunks) -> tuple[Tensor, Tensor]:
-        energies, slopes = zip(*chunks.run(both, len(pose)), strict=True)
-        return torch.cat(energies), torch.cat(slopes)
+        energies, gradients = zip(*chunks.run(both, len(pose)), strict=True)
+        return torch.cat(energies), torch.cat(gradients)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
@@ -87,8 +87,8 @@ class EnergyAndSlope(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, None, None]:
-        (slopes,) = ctx.saved_tensors
-        return grad[:, None] * slopes, None, None
+        (gradients,) = ctx.saved_tensors
+        return grad[:, None] * gradients, None, None
 
 
 class Zero123Prior(Prior):
@@ -189,9 +189,9 @@ class Zero123Prior(Prior):
         self.check(target, source, pose, timestep, noise)
         inputs = pose, target.latent, source.latent, source.embedding, timestep, noise
         if pose.requires_grad and torch.is_grad_enabled():
-            function = self._energy_and_slope
+            function = self._energy_and_grad
             both = partial(self.replayed, function) if self.cuda_graph else function
-            energies, _ = EnergyAndSlope.apply(pose, lambda part: both(*(each[part] for each in inputs)), self.chunks)
+            energies, _ = StoredGradient.apply(pose, lambda part: both(*(each[part] for each in inputs)), self.chunks)
             return energies
         return torch.cat(self.chunks.run(lambda part: self._energy(*(each[part] for each in inputs)), len(pose)))
 
@@ -201,12 +201,12 @@ class Zero123Prior(Prior):
         codes = ViewCode(target, embedding), ViewCode(source, embedding)  # the target's embedding is unused
         return self._residual(*codes, pose, timestep, noise).square().flatten(1).mean(dim=1)
 
-    def _energy_and_slope(self, pose: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    def _energy_and_grad(self, pose: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
         with torch.enable_grad():
             pose = pose.detach().requires_grad_()
             energies = self._energy(pose, *others)
-            (slope,) = torch.autograd.grad(STEEPER * energies.sum(), pose)
-        return energies.detach(), slope / STEEPER
+            (gradient,) = torch.autograd.grad(GRAD_SCALE * energies.sum(), pose)
+        return energies.detach(), gradient / GRAD_SCALE
 
     @torch.no_grad()
     def generate(

@@ -26,7 +26,7 @@ WEIGHT_FILES = [  # of diffusers and transformers, in order of preference
     for stem in ("diffusion_pytorch_model", "pytorch_model" if suffix == "bin" else "model")
 ]
 OLD_VAE_NAMES = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}  # before diffusers 0.18
-LEFT_OVER = ("vision_model.embeddings.position_ids",)  # before transformers 4.31
+IGNORED = ("vision_model.embeddings.position_ids",)  # before transformers 4.31
 HUB_ID = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*")
 
 
@@ -100,7 +100,7 @@ def _weights(folder: Path) -> dict[str, StoredTensor]:
         with expecting(f"{file}: names no files of weights; download it again"):
             files = [file.with_name(name) for name in sorted({*read_json(file)["weight_map"].values()})]
     tensors = {name: stored for each in files for name, stored in read(each).items()}
-    return {name: stored for name, stored in tensors.items() if name not in LEFT_OVER}
+    return {name: stored for name, stored in tensors.items() if name not in IGNORED}
 
 
 def write_folder(networks: Networks, path: Path) -> None:
