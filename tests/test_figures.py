@@ -339,13 +339,16 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
     [
         (
             ["figure=toy"],
-            "needs an energy model, and none ships: train one with `python -m lp_framework train model=en",
+            "needs an energy model, and none is bundled: train one with `python -m lp_framework train model=en",
         ),
-        (["figure=toy", "figure.energy=score"], "figure.energy=score: holds no energy model"),
-        (["figure=cameras", "figure.score=energy"], "figure.score=energy: holds no score model"),
+        (["figure=toy", "figure.energy=score"], "figure.energy=score: contains no energy model"),
+        (["figure=cameras", "figure.score=energy"], "figure.score=energy: contains no score model"),
         (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data set has no object 'cap'; did you mean"),
         (["figure=recall", "figure.runs=none"], "runs=none: there is no such folder"),
-        (["figure=recall", "figure.runs=score"], "no finished runs with several numbers of starts; `python -m lp_fr"),
+        (
+            ["figure=recall", "figure.runs=score"],
+            "no finished runs with several numbers of starts; run `python -m lp_fr",
+        ),
         (
             ["figure=failures", "figure.objects=[cup]", "figure.timesteps=[1000]"],
             "this prior has timesteps 0 to 999, got 1000",

@@ -84,8 +84,8 @@ class Page(HTMLParser):
                 self.headings.append(data)
 
     @property
-    def said(self) -> str:
-        """All that the page says, in one line."""
+    def visible(self) -> str:
+        """The visible text, in one line."""
         return " ".join(" ".join(self.words).split())
 
 
@@ -179,7 +179,7 @@ def evaluation() -> tuple[Evaluation, PairData]:
     return evaluation, data
 
 
-def test_examples_have_the_evaluations_answers_with_the_whole_way_to_them(evaluation):
+def test_examples_have_the_evaluations_answers_with_their_trajectories(evaluation):
     evaluation, data = evaluation
     examples = gather_examples(evaluation, data)
     rows = evaluation.metrics.rows()
@@ -251,7 +251,7 @@ def test_a_page_is_whole_in_itself(kind, tmp_path):
     assert "url(" not in style_text and "@import" not in style_text
     policy = next(each["content"] for tag, each in page.elements if each.get("http-equiv") == "Content-Security-Policy")
     assert "default-src 'none'" in policy and "http" not in policy
-    assert "Not shown" not in page.said.replace("Not shown: they were not recorded.", "")
+    assert "Not shown" not in page.visible
     assert any("width=device-width" in (each.get("content") or "") for _, each in page.elements)
 
 
@@ -260,7 +260,7 @@ def test_names_cannot_break_out(tmp_path):
     assert not any(attributes.get("onerror") for _, attributes in page.elements)
     assert not any(tag == "img" and not attributes["src"].startswith("data:") for tag, attributes in page.elements)
     shown = NASTY.replace("_", " ")
-    assert page.said.count(shown) >= 3  # a card, a row an object, rows of the worst pairs
+    assert page.visible.count(shown) >= 3  # a card, a row an object, rows of the worst pairs
     assert cards(page) == [shown, "vase", "red mug"]  # failures first
 
 
@@ -279,11 +279,11 @@ def test_the_data_of_a_page_are_those_of_the_run(tmp_path):
     assert [trace["visible"] for trace in contours] == [True, False]
     np.testing.assert_allclose(np.array(contours[0]["z"])[:, :-1], energy, atol=1e-4)
     minima = expected.landscapes["energy of the prior"].minima()
-    assert len(minima) == 2 and "energy of the prior 2 valleys, the deepest first: " in page.said.replace("\n", " ")
+    assert len(minima) == 2 and "energy of the prior 2 minima, deepest first: " in page.visible.replace("\n", " ")
     curves = [trace for trace in page.figures["errors"][0]["data"] if trace["mode"] == "lines"]
     assert [curve["name"] for curve in curves] == [f"{kind} (4 pairs)" for kind in ("unique", "twofold", "continuous")]
     assert curves[0]["y"][-1] == 0.75  # one of four pairs has no answer
-    assert "R@5, unique answer" in page.said and "Configuration" in page.said and "torch" in page.said
+    assert "R@5, unique answer" in page.visible and "Configuration" in page.visible and "torch" in page.visible
 
 
 def test_the_marks_of_a_pair_are_at_its_poses_in_every_frame(tmp_path):
@@ -311,14 +311,14 @@ def test_the_marks_of_a_pair_are_at_its_poses_in_every_frame(tmp_path):
     np.testing.assert_allclose(found, np.stack([x, -z, y]).T, atol=1e-3)
 
 
-def test_a_long_way_has_few_frames_and_its_last_step_among_them(tmp_path):
+def test_a_long_trajectory_has_few_frames_including_its_last_step(tmp_path):
     folder = write_evaluation(tmp_path / "run")
     save_examples(folder / "pictures" / EXAMPLES, [example(steps=500)])
     page = page_of(folder)
     for kind in ("map", "surface", "cameras"):
         (figure,) = page.figures[kind]
         assert len(figure["layout"]["meta"]["frames"]) == 40
-    assert "step 500 of 500" in page.said
+    assert "step 500 of 500" in page.visible
 
 
 @pytest.mark.parametrize(
@@ -348,23 +348,23 @@ def test_a_long_way_has_few_frames_and_its_last_step_among_them(tmp_path):
     ],
     ids=lambda each: str(each)[:40],
 )
-def test_what_is_missing_or_damaged_is_said_and_the_rest_is_shown(kind, file, content, tmp_path):
+def test_a_note_replaces_what_is_missing_or_damaged(kind, file, content, tmp_path):
     folder = WRITERS[kind](tmp_path / "run")
     if content is None:
         (folder / file).unlink()
     else:
         (folder / file).write_text(content)
     page = page_of(folder)
-    assert re.search("Not shown: .*\\.|unfinished|without results|missing", page.said)
-    assert "Configuration and versions" in page.said
+    assert re.search("Not shown: .*\\.|unfinished|no results|missing", page.visible)
+    assert "Configuration and versions" in page.visible
 
 
 def test_a_run_without_pictures_has_its_tables(tmp_path):
     folder = write_evaluation(tmp_path / "run")
     shutil.rmtree(folder / "pictures")
     page = page_of(folder)
-    assert "Not shown: the run has no pictures, as with pictures=false." in page.said
-    assert "R@5, unique answer" in page.said and "The 12 worst pairs" in page.said
+    assert "Not shown: the run has no pictures (pictures=false)." in page.visible
+    assert "R@5, unique answer" in page.visible and "The 12 worst pairs" in page.visible
 
 
 def test_the_colours_are_those_of_the_figures():
@@ -404,8 +404,8 @@ def test_runs_that_would_make_the_page_too_large_are_in_the_table_alone(tmp_path
     monkeypatch.setattr(page_module, "LARGEST", sizes[0] - 2_000_000)  # without plotly.js: room for one
     page = Page(write_report_page(tmp_path / "report.html", runs, {}))
     left_out = 3 - sum(tag == "details" and each.get("class") == "run" for tag, each in page.elements)
-    assert left_out >= 1 and f"{left_out} runs would make this page too large" in page.said
-    assert all(str(folder) in page.said for folder, _ in runs)
+    assert left_out >= 1 and f"{left_out} runs are only in the table" in page.visible
+    assert all(str(folder) in page.visible for folder, _ in runs)
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -425,8 +425,8 @@ def test_report_of_runs_of_several_commands(lp, tmp_path):
     ran = lp("report", "runs=runs", "objects=all", "hydra.run.dir=out")
     assert ran.status == 0, ran.err
     assert ran.out.startswith("5 runs; metrics over all objects")
-    said = Page(tmp_path / "out" / "report.html").said
-    assert all(name in said for name in ("Evaluations", "Trainings", "Estimates", "Landscapes"))
+    visible = Page(tmp_path / "out" / "report.html").visible
+    assert all(name in visible for name in ("Evaluations", "Training runs", "Estimates", "Landscapes"))
 
 
 # ---------------------------------------------------------------- in a browser
@@ -542,7 +542,7 @@ FRAME = """(step) => [...document.querySelectorAll('.stage:not([hidden]) .plot')
 def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tmp_path):
     page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"))
     scroll_through(page)
-    slider = page.get_by_label("step of the solver").first
+    slider = page.get_by_label("solver step").first
     assert slider.input_value() == slider.get_attribute("max") == str(STEPS)
     at_the_end = page.evaluate(MARKS)
     assert at_the_end == page.evaluate(FRAME, STEPS)
@@ -566,7 +566,7 @@ def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tm
     assert "off by 3.0°" in page.locator(".pair-facts:visible").inner_text()
     assert cards.nth(2).get_attribute("aria-pressed") == "true"
     scroll_through(page)
-    assert page.locator(".plot.surface.drawn").count() == 1  # the one of the first pair has been put away
+    assert page.locator(".plot.surface.drawn").count() == 1  # the one of the first pair has been removed
     shown = "document.querySelector('.stage:not([hidden]) .plot.surface')._fullData.filter((trace) => trace.visible)"
     assert page.evaluate(f"new Set({shown}.map((trace) => trace.meta)).size") == 1
     page.locator("select:visible").select_option("length of the model's score")
@@ -585,7 +585,7 @@ def test_a_table_sorts_by_click_and_by_keyboard(opened, tmp_path):
         return table.locator("tbody th").all_inner_texts()
 
     nasty = NASTY.replace("_", " ")
-    assert names() == [nasty, "vase", "red mug"]  # by recall, the worst first
+    assert names() == [nasty, "vase", "red mug"]  # worst recall first
     recall = table.get_by_role("button", name="R@15", exact=True)
     head = table.locator("th", has=page.get_by_role("button", name="R@15", exact=True))
     recall.click()

@@ -180,7 +180,7 @@ def test_the_joint_solver_from_the_command_line(commands):
         assert float(row["longitude_degrees"]) == pytest.approx(math.degrees(example.ends[0, 1]), abs=0.02)
         assert example.trajectories is None and len(example.ends) == 1
     page = (ran.folder / "report.html").read_text()
-    assert "the solver's steps were not kept" in html.unescape(page) and "slider plays" not in page
+    assert "the solver's steps were not recorded" in html.unescape(page) and "slider shows" not in page
     fit = commands.here("fit", "eval", *settings, "solver.second_stage=false")
     assert fit.json()["seconds_per_pair"] < ran.json()["seconds_per_pair"]
 

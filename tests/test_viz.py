@@ -339,7 +339,7 @@ def test_scattered_losses_are_averaged_and_a_diverged_run_is_drawn():
     (axes,) = training_figure({"train/loss": Curve(steps, values)}, None).axes
     raw, mean = axes.lines
     np.testing.assert_array_equal(raw.get_ydata(), values)
-    assert np.abs(mean.get_ydata() - 2).max() < 0.6 and mean.get_label() == "training loss, mean of 5 records"
+    assert np.abs(mean.get_ydata() - 2).max() < 0.6 and mean.get_label() == "training loss, mean over 5 values"
     lost = Curve(steps, np.full(100, np.nan))
     training_figure({"train/loss": lost, "val/loss": lost}, None).draw_without_rendering()
 

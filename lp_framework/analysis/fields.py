@@ -41,11 +41,11 @@ class Draws(NamedTuple):
         """Describe the draws in a sentence.
 
         >>> Draws([100, 900], 5, seed=0).in_words()
-        'Mean over both directions of the pair, timesteps 100, 900 and 5 noises at each.'
+        'Mean over both directions of the pair, timesteps 100, 900 and 5 noises per timestep.'
         """
         each = "one noise" if self.noises == 1 else f"{self.noises} noises"
         steps = ", ".join(map(str, self.timesteps))
-        return f"Mean over both directions of the pair, timesteps {steps} and {each} at each."
+        return f"Mean over both directions of the pair, timesteps {steps} and {each} per timestep."
 
 
 def checked_draws(timesteps: object, noises: object, seed: int, batch: object = 64) -> Draws:

@@ -66,10 +66,10 @@ def figure_model(kind: Literal["score", "energy"], path: str | None) -> PoseMode
     """
     if path is None and kind == "energy":
         raise UserError(
-            "this figure needs an energy model, and none ships: train one with `python -m lp_framework train "
+            "this figure needs an energy model, and none is bundled: train one with `python -m lp_framework train "
             "model=energy hydra.run.dir=runs/energy`, then add figure.energy=runs/energy"
         )
     model = load_model(SHIPPED / "score" if path is None else path)
     if model.has_energy != (kind == "energy"):
-        raise UserError(f"figure.{kind}={path}: holds no {kind} model")
+        raise UserError(f"figure.{kind}={path}: contains no {kind} model")
     return model

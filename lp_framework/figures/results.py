@@ -49,7 +49,7 @@ class CamerasFigure(PaperFigure):
     def __post_init__(self) -> None:
         if not self.objects or not self.methods or self.targets < 1 or self.starts < 1:
             raise UserError(
-                "figure.objects and figure.methods need at least one name each, targets and starts must be at least 1"
+                "figure.objects and figure.methods need at least one name each; targets and starts must be at least 1"
             )
         wanted = {part for name in self.methods for part in registry.component_names(registry.get("solver", name))}
         self.model = figure_model("score", self.score) if "model" in wanted else None
@@ -85,9 +85,9 @@ class CamerasFigure(PaperFigure):
     def draw(self, contents: list[CameraScene]) -> tuple[Figure, str]:
         names = ", ".join(scene.title for scene in contents)
         return camera_methods_figure(contents, self.named), (
-            f"Predicted (thin) and true cameras (bold) of {len(contents[0].images) - 1} views of each object "
-            f"({names}), relative to the reference (red), from {self.starts} random starts for each view: "
-            f"{' and '.join(self.named)}. Counted are the predictions within {NEAR_DEGREES:g} degrees."
+            f"Predicted (thin) and true (bold) cameras of {len(contents[0].images) - 1} views per object ({names}), "
+            f"relative to the reference (red), from {self.starts} random starts per view, for "
+            f"{' and '.join(self.named)}. Counts: predictions within {NEAR_DEGREES:g} degrees of the truth."
         )
 
 
@@ -108,7 +108,7 @@ class RecallFigure(PaperFigure):
 
     def analyse(self, seed: int, device: torch.device) -> SweepTable:
         """Read the table of the experiment; deterministic."""
-        make = f"`python -m lp_framework eval experiment={EXPERIMENT}` makes them"
+        make = f"run `python -m lp_framework eval experiment={EXPERIMENT}` first"
         if not Path(self.runs).is_dir():
             raise UserError(f"figure.runs={self.runs}: there is no such folder of finished runs; {make}")
         found, _ = find_runs([Path(self.runs)])
@@ -124,6 +124,6 @@ class RecallFigure(PaperFigure):
         assert figure is not None  # the number of starts varies
         seeds = max(len(row.seeds) for row in contents.rows)
         return figure, (
-            "Recall within 30 degrees (and a translation error of 0.2) for different numbers of random starts, and for "
-            f"the seconds that they take, over {LABELS[self.objects]}; bars: standard deviation over {seeds} seeds."
+            "Recall within 30 degrees (and a translation error of 0.2) over the number of random starts, and over the "
+            f"time they take, for {LABELS[self.objects]}. Error bars: standard deviation over {seeds} seeds."
         )

@@ -74,7 +74,7 @@ def run_part(folder: Path, contents: Contents) -> RunPart:
     try:
         about = contents.about(folder)
     except BROKEN as error:
-        about = folder.name, f"run without results: {reason(error)}", {}
+        about = folder.name, f"no results: {reason(error)}", {}
     sections = {}
     configuration = {"Configuration and versions": ("configuration", _configuration)}
     for title, (template, values) in {**contents.sections, **configuration}.items():
@@ -90,8 +90,8 @@ def reason(error: Exception) -> str:
     if isinstance(error, UserError):
         return str(error)
     if isinstance(error, FileNotFoundError):
-        return f"there is no {Path(error.filename).name}"
-    return f"its files are damaged ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
+        return f"{Path(error.filename).name} is missing"
+    return f"damaged files ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
 
 
 def render(template: str, **values: Any) -> str:
@@ -196,7 +196,7 @@ def _sections_of_several(runs: Sequence[tuple[Path, Kind]]) -> dict[str, str]:
     for heading in dict.fromkeys(run["heading"] for run in listed):
         some = [run for run in listed if run["heading"] == heading]
         sections[heading] = render("runs.html.j2", caption=heading, runs=some)
-    return {**sections, "Run by run": render("opened.html.j2", runs=listed)}
+    return {**sections, "Details of each run": render("opened.html.j2", runs=listed)}
 
 
 def _about_evaluation(folder: Path) -> About:
@@ -220,7 +220,7 @@ def _about_evaluation(folder: Path) -> About:
 def _pairs(folder: Path) -> dict[str, Any]:
     """The pairs that a run saved with its pictures, each with its plots (packed, by kind) and the steps they show."""
     if not (folder / "pictures").is_dir():
-        raise UserError("the run has no pictures, as with pictures=false")
+        raise UserError("the run has no pictures (pictures=false)")
     shown = []
     for example in read_examples(folder / "pictures" / EXAMPLES):
         drawn = {kind: packed(figure) for kind, figure in plots.pair_plots(example).items()}
@@ -253,15 +253,15 @@ def _about_training(folder: Path) -> About:
     best = {"best validation loss": f"{np.nanmin(losses['val/loss'].value):.4g}"} if "val/loss" in losses else {}
     title = f"{words(config['model']['name'])} model, trained on {config['data']['name']}"
     if not report:
-        return title, "unfinished training", best
+        return title, "unfinished training run", best
     counts = {key: str(report[key]) for key in ("epochs", "steps")}
-    return title, f"training over {report['epochs']} epochs, seed {report['seed']}", best | counts
+    return title, f"trained for {report['epochs']} epochs, seed {report['seed']}", best | counts
 
 
 def _losses(folder: Path) -> dict[str, Any]:
     losses, rate = read_losses(folder / "metrics.csv")
     if not losses:
-        raise UserError("no loss was logged")
+        raise UserError("no losses were logged")
     return {"figure": plots.losses_plot(losses, rate)}
 
 
@@ -274,7 +274,7 @@ def _about_estimate(folder: Path) -> About:
     return (
         f"Cameras by {words(result['config']['solver']['name'])}",
         "camera poses of photographs; the first is the reference",
-        {"photographs": str(len(rows)), "with a pose": str(found), **judged, "seconds": f"{result['seconds']:.3g}"},
+        {"photographs": str(len(rows)), "poses found": str(found), **judged, "seconds": f"{result['seconds']:.3g}"},
     )
 
 
@@ -318,15 +318,15 @@ def _about_landscape(folder: Path) -> About:
     if answer is not None and answer["rotation_error"] is not None:
         numbers["rotation error of the answer"] = f"{answer['rotation_error']:.1f}°"
     title = f"Landscape of {files}" if name is None else f"Landscape of {words(name)}, {files}"
-    return title, "the energy of the prior over the relative pose of a pair, and the trajectories of a solver", numbers
+    return title, "energy of the prior over the relative pose of a pair, with solver trajectories", numbers
 
 
 def _about_azimuths(folder: Path) -> About:
     record = read_record(folder / OVERVIEW)
-    names = {"within": "least energy within 15°, all objects", "within_unique_answer": "the same, unique answer"}
+    names = {"within": "lowest energy within 15°, all objects", "within_unique_answer": "unique answers only"}
     return (
         f"Landscapes of {record['config']['data']['name']}, prior {record['config']['prior']['name']}",
-        "the energy of the prior around each object, at the true latitude and radius",
+        "energy of the prior around each object, at the true latitude and radius",
         {label: f"{record[key]:.1%}" for key, label in names.items() if record.get(key) is not None},
     )
 
@@ -336,8 +336,8 @@ CONTENTS: Mapping[str, Contents] = {
         "Summary": ("summary", lambda folder: {"result": read_record(folder / RESULT)}),
         "Pairs, failures first": ("pairs", _pairs),
         "Objects": ("objects", _objects), "Errors": ("errors", _errors)}),
-    "train": Contents("Trainings", _about_training, {
-        "Losses": ("losses", _losses), "Last values": ("last", lambda folder: read_record(folder / TRAINING))}),
+    "train": Contents("Training runs", _about_training, {
+        "Losses": ("losses", _losses), "Final values": ("last", lambda folder: read_record(folder / TRAINING))}),
     "estimate": Contents("Estimates", _about_estimate, {
         "Cameras": ("cameras", _cameras), "Poses": ("poses", _poses)}),
     "landscape": Contents("Landscapes", _about_landscape, {

@@ -89,7 +89,7 @@ def find_runs(folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
             continue
         first = runs.setdefault(json.dumps([run.settings, run.seed, run.checkpoint, run.experiment]), run)
         if first is not run:
-            left_out.append(LeftOut(folder, f"repeats {first.folder}: the same settings and seed"))
+            left_out.append(LeftOut(folder, f"duplicate of {first.folder} (same settings and seed)"))
     return [*runs.values()], left_out
 
 

@@ -33,7 +33,7 @@ SECONDS, SOLVER = "seconds_per_pair", "solver.name"
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, INK, MUTED)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = (0, (3, 2))  # for the paper's curves
-PAPER = "the paper: other data, other prior"
+PAPER = "paper (other data and prior)"
 PLACE = ("data.name", "protocol", "checkpoint", "prior.name", "solver.name", "start.name", "views")  # of all runs
 
 
@@ -176,8 +176,8 @@ def _panels(table: SweepTable, axis: str) -> list[Panel]:
         return [_panel(table, axis, name, {"": name}) for name in ("R@15", "R@30")]
     if axis == "start.count":
         first, *_, last = sorted({row.settings[axis] for row in table.rows})
-        by_time = f"R@30 by time, from {shown(first)} to {shown(last)} starts"
-        by_count = _panel(table, axis, "R@30 by number of starts", {"": "R@30"})
+        by_time = f"R@30 over time, from {shown(first)} to {shown(last)} starts"
+        by_count = _panel(table, axis, "R@30 over the number of starts", {"": "R@30"})
         return [by_count, _panel(table, axis, by_time, {"": "R@30"}, by_time=True)]
     if len(table.groups_along(axis)) > 1:  # one colour each
         return [_panel(table, axis, f"{title}, {WITHIN[-1]}", {"": each[-1]}) for title, each in PANELS.items()]

@@ -296,7 +296,7 @@ def metrics_note(objects: Objects) -> str:
 def sweep_sections(sweeps: Sequence[Sweep], left_out: Sequence[LeftOut]) -> dict[str, str]:
     """The page's sections for sweeps and for the runs left out of their tables: HTML by title."""
     sections = {sweep.title: render("sweep.html.j2", sweep=sweep) for sweep in sweeps}
-    return sections | ({"Left out": render("left_out.html.j2", left_out=left_out)} if left_out else {})
+    return sections | ({"Skipped runs": render("left_out.html.j2", left_out=left_out)} if left_out else {})
 
 
 def write_sweeps(

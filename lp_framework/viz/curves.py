@@ -21,7 +21,7 @@ from lp_framework.viz import style
 NEAREST = 0.01  # scene units; start of the logarithmic axis of translation errors
 DASHED: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (3, 2)), "zorder": 2}
 LOSSES = {"train/loss": (style.BLUE, "training loss"), "val/loss": (style.VERMILION, "validation loss"),
-          "train/view_loss": (style.GREEN, "training, view readout")}  # fmt: skip
+          "train/view_loss": (style.GREEN, "training loss of the view readout")}  # fmt: skip
 COLUMNS = 4  # of objects
 
 
@@ -91,10 +91,10 @@ def calibration_figure(bins: Sequence[Mapping[str, float]], title: str) -> Figur
     figure = Figure(figsize=(4.4, 4.4), layout="constrained")
     axes = figure.subplots()
     probability, right, pairs = (np.array([each[key] for each in bins]) for key in ("probability", "right", "pairs"))
-    axes.plot([0, 1], [0, 1], color=style.MUTED, label="calibrated", **DASHED)
+    axes.plot([0, 1], [0, 1], color=style.MUTED, label="perfect calibration", **DASHED)
     axes.plot(probability, right, color=style.BLUE, zorder=3)
     axes.scatter(probability, right, 20 + 600 * pairs / pairs.sum(), color=style.BLUE, alpha=0.6, zorder=4, linewidth=0)
-    axes.set(xlim=(0, 1), ylim=(0, 1.02), aspect="equal", xlabel="probability that the model tells")
+    axes.set(xlim=(0, 1), ylim=(0, 1.02), aspect="equal", xlabel="predicted probability")
     axes.set_ylabel("share within 30°")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(PercentFormatter(1.0))
@@ -153,7 +153,7 @@ def training_figure(losses: Mapping[str, Curve], rate: Curve | None) -> Figure:
         if window > 1:
             # Losses of single batches are noisy: draw them pale, behind their running mean.
             above.plot(*curve, color=colour, marker=".", markersize=2.5, linestyle="none", alpha=0.3, zorder=1)
-            curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean of {window} records"
+            curve, label = Curve(curve.step, running_mean(curve.value, window)), f"{label}, mean over {window} values"
         marker = "" if len(curve.step) > 30 else "o"
         above.plot(*curve, color=colour, label=label, clip_on=False, marker=marker, markersize=3.5)
         if name == "val/loss" and np.isfinite(curve.value).any():
@@ -202,8 +202,8 @@ def azimuth_figure(objects: Sequence[Mapping[str, Any]]) -> Figure:
         axes.locator_params(axis="y", nbins=4)
     for axes in list(grid.flat)[len(objects) :]:
         axes.remove()
-    figure.supxlabel("longitude from the truth; in the title: share of pairs whose least energy is within 15°", size=8)
-    figure.supylabel("denoising error above its least", size=8)
+    figure.supxlabel("longitude from the truth; in titles: share of pairs with the lowest energy within 15°", size=8)
+    figure.supylabel("denoising error above its minimum", size=8)
     keys = style.class_keys([each["ambiguity"] for each in objects])
     figure.legend(handles=keys, loc="outside upper center", ncols=len(keys), labelcolor=style.MUTED)
     return figure

@@ -202,7 +202,7 @@ def pair_figure(
     marks = keys(maps, pair.truth)
     figure.legend(handles=marks, loc="outside lower right", ncols=len(marks), handletextpad=0.3, columnspacing=1.3)
     for part in lower:
-        part.suptitle("Generated at the ends of the trajectories, by their starts", x=0.05, ha="left", fontsize=8)
+        part.suptitle("Views generated at the final poses, labelled by start longitude", x=0.05, ha="left", fontsize=8)
         shown = zip(style.panels(part, len(views), 5), views, ends_in_words(pair), strict=True)
         for number, (axes, image, words) in enumerate(shown):
             frame: Any = {"color": style.ANSWER, "linewidth": 1.6} if number == pair.chosen else {}
@@ -306,7 +306,7 @@ def trajectories_figure(pair: ShownPair, views: NDArray, steps: Sequence[int]) -
     figure = Figure(figsize=(WIDTH, max(3.0, 0.4 + 0.65 * len(views))), layout="constrained")
     left, middle, right = style.beside(figure, 1.2, 0.6 + 0.62 * len(steps), 2.5)
     _draw_pair(left.subplots(2, 1), pair)
-    middle.suptitle("(c) generated on the way", x=0.02, ha="left", fontsize=8.5)
+    middle.suptitle("(c) generated along the trajectories", x=0.02, ha="left", fontsize=8.5)
     grid = middle.subplots(*views.shape[:2], squeeze=False)
     for number, (row, words) in enumerate(zip(grid, ends_in_words(pair), strict=True)):
         answer = number == pair.chosen
@@ -351,7 +351,7 @@ def failures_figure(rows: Sequence[FailureRow]) -> Figure:
             axes.set_title(f"{360 * place / count:g}°", loc="center", **style.ASIDE)
         _small_map(right.subplots(), PoseMap(relief=pair.prior_energy), pair.truth, last=number == len(rows) - 1)
         if number == 0:
-            titles = ("(a) pair", "(b) turned around the object", "(c) landscape")
+            titles = ("(a) pair", "(b) views around the object", "(c) landscape")
             for each, title in zip((left, middle, right), titles, strict=True):
                 each.suptitle(title, x=0.02, ha="left", fontsize=8.5)
     return figure

@@ -1,23 +1,23 @@
 "use strict";
-// Tables that sort, plots that are drawn when they come into view, and pairs along whose ways a slider moves the marks.
+// Sortable tables, plots drawn when they scroll into view, and a slider that moves the marks of a pair along trajectories.
 (() => {
   for (const table of document.querySelectorAll("table[data-sorts]")) {
     const heads = [...table.tHead.rows[0].cells];
     heads.forEach((head, column) => head.firstElementChild.addEventListener("click", () => {
-      // Numbers begin with the largest, words with the first.
+      // First click: numbers in descending order, words in ascending order.
       const [first, other] = head.classList.contains("number") ? ["descending", "ascending"] : ["ascending", "descending"];
       const order = head.getAttribute("aria-sort") === first ? other : first;
       for (const each of heads) each.setAttribute("aria-sort", each === head ? order : "none");
       const sign = order === "ascending" ? 1 : -1;
       const sorted = [...table.tBodies[0].rows].map((row) => [sortKey(row.cells[column]), row]).sort(([a], [b]) => {
-        if (a === "" || b === "") return (a === "") - (b === ""); // what has no value is last either way
+        if (a === "" || b === "") return (a === "") - (b === ""); // missing values are always last
         return sign * (typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(String(b), undefined, { numeric: true }));
       });
       table.tBodies[0].append(...sorted.map(([, row]) => row));
     }));
   }
 
-  // A number that the text begins with, else the text.
+  // The number at the start of the text, or else the text.
   function sortKey(cell) {
     const text = (cell.dataset.value ?? cell.textContent.trim()).replace("\u2212", "-").replace(/^(inf|\u221e)$/, "Infinity");
     const number = parseFloat(text);
@@ -29,7 +29,7 @@
     return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
   }
 
-  let library = null; // the promise of plotly.js, which is unpacked once
+  let library = null; // promise of plotly.js, unpacked on first use
   const plotly = () => (library ??= (async () => {
     const script = document.createElement("script");
     script.textContent = await unpack(document.getElementById("plotly").textContent);
@@ -38,7 +38,7 @@
   })());
 
   const CONFIG = { displaylogo: false, responsive: true, scrollZoom: false, displayModeBar: false };
-  const drawn = new Map(); // element: its figure, in the colours of the moment
+  const drawn = new Map(); // element -> figure in the current colours
 
   async function draw(element) {
     try {
@@ -54,7 +54,7 @@
     }
   }
 
-  // A plot as it is; in the stage of a pair with its marks at the slider's step, over the landscape that is chosen.
+  // Draw a plot; for a pair, with the marks at the slider's step and only the selected landscape.
   function show(element) {
     const { data, layout } = drawn.get(element);
     const [slider, choice] = ["input", "select"].map((name) => element.closest(".stage")?.querySelector(name));
@@ -83,20 +83,20 @@
       cards.forEach((each, place) => each.setAttribute("aria-pressed", String(place === chosen)));
       stages.forEach((stage, place) => {
         stage.hidden = place !== chosen;
-        if (stage.hidden) stage.querySelectorAll(".plot.drawn").forEach(putAway);
+        if (stage.hidden) stage.querySelectorAll(".plot.drawn").forEach(removePlot);
       });
     }));
   }
 
-  // Browsers keep few drawings in space at a time: those of a hidden pair go, and are made anew when it is shown.
-  function putAway(element) {
+  // Browsers limit the number of WebGL contexts, so plots of hidden pairs are removed and drawn again when shown.
+  function removePlot(element) {
     window.Plotly.purge(element);
     drawn.delete(element);
     element.classList.remove("drawn");
     comesIntoView.observe(element);
   }
 
-  // The player of a pair: its slider moves the marks of all three plots.
+  // The slider of a pair moves the marks of all three plots.
   function startStage(stage) {
     const [slider, play, output, choice] = ["input", "button", "output", "select"].map((name) => stage.querySelector(name));
     const update = () => stage.querySelectorAll(".plot.drawn").forEach(show);
@@ -124,7 +124,7 @@
       playing = setInterval(() => {
         go(Number(slider.value) + 1);
         if (Number(slider.value) === last || stage.hidden) stop();
-      }, 6000 / last); // all of it takes six seconds
+      }, 6000 / last); // playback takes six seconds
     }
 
     slider.addEventListener("input", () => { stop(); go(Number(slider.value)); });
