@@ -117,7 +117,7 @@ def _task(command: str, options: Sequence[str], failed: list[UserError]) -> Call
             except (UserError, errors.InterpolationResolutionError) as error:
                 mistake = error if isinstance(error, UserError) else UserError(explain(error))
                 if sweep and isinstance(error, Held):
-                    print(f"skipped, another command is working on it: {relative(folder)}")
+                    print(f"skipped (in use by another command): {relative(folder)}")
                     return
                 if not isinstance(error, Held):
                     remove_if_empty(folder, f"{job.job.name}.log")
@@ -283,7 +283,7 @@ def explain(error: Exception) -> str:
             known = error.options or catalogue.choices(group)  # Hydra lists no options for choices made in a file
             message = f"{group}={choice}: there is no {group} '{choice}'{among(choice, known)}"
             if group == "hydra/launcher":
-                return f"{message}; pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]' brings some"
+                return f"{message}; for more: pip install 'lp_framework[{'ray' if 'ray' in choice else 'sweeps'}]'"
             return message + ("; some plugins could not be loaded, see above" if registry.failures() else "")
         case OverrideParseException():
             key, equals, value = error.override.partition("=")

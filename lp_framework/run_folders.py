@@ -38,7 +38,7 @@ def held(folder: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=0)
         except Timeout as error:
-            raise Held(f"{folder}: another command works in this folder; let it finish, or choose another") from error
+            raise Held(f"{folder}: is in use by another command; wait for it, or choose another folder") from error
         except OSError as error:
             raise UserError(f"{folder / LOCK}: cannot be written ({reason(error, folder)})") from error
     try:

@@ -321,7 +321,7 @@ def test_odd_settings_of_the_trainer(commands, setting, sentence):
 
 def test_a_checkpoint_that_is_not_there(commands):
     assert commands.here("x", "eval", "checkpoint=gone.ckpt").error == "gone.ckpt: there is no such checkpoint"
-    assert commands.here("x", "eval", "checkpoint=views").error.startswith("views: holds no checkpoints/best.ckpt")
+    assert commands.here("x", "eval", "checkpoint=views").error.startswith("views: contains no checkpoints/best.ckpt")
 
 
 @pytest.mark.parametrize("kind", ["text", "empty", "truncated", "code", "code in a checkpoint"])
@@ -342,17 +342,17 @@ def test_a_file_that_is_no_readable_checkpoint(commands, kind):
 
 def test_the_checkpoint_of_something_else(commands):
     stored(commands, "foreign.ckpt", lp_framework=None)
-    wanted = "foreign.ckpt: is a checkpoint of something else; one that `lp train` wrote is wanted"
+    wanted = "foreign.ckpt: is not a checkpoint written by `lp train`"
     assert commands.here("x", "eval", "checkpoint=foreign.ckpt").error == wanted
 
 
 def test_weights_of_another_size_or_model(commands):
     stored(commands, "wider.ckpt", lp_framework=recipe(commands, "model", hidden=32))
     assert commands.here("x", "eval", "checkpoint=wider.ckpt").error.startswith(
-        "wider.ckpt: its weights are of another score model: size mismatch for network."
+        "wider.ckpt: its weights do not fit its score model: size mismatch for network."
     )
     stored(commands, "deeper.ckpt", lp_framework=recipe(commands, "model", layers=4))
-    assert 'weights are of another score model: Missing key(s) in state_dict: "network.residual.3' in (
+    assert 'weights do not fit its score model: Missing key(s) in state_dict: "network.residual.3' in (
         commands.here("x", "eval", "checkpoint=deeper.ckpt").error
     )
 

@@ -212,7 +212,7 @@ def test_a_run_that_is_resumed_does_not_run_what_its_checkpoint_brings(tmp_path)
         shutil.copyfile(last, best)
         ran = commands.here("unused", "train", "resume=run", "trainer.max_epochs=2")
         assert ran.status == 1
-        assert "is not a readable checkpoint (damaged, or holding more than numbers" in ran.error
+        assert "is not a readable checkpoint (damaged, or contains more than numbers" in ran.error
         assert not (commands.folder / "executed").exists()
 
 

@@ -83,7 +83,7 @@ def test_the_same_settings_and_seed_count_once(tmp_path):
     write_result(tmp_path / "2")
     runs, ((folder, reason),) = find_runs([tmp_path])
     assert [run.folder.name for run in runs] == ["1"]
-    assert folder.name == "2" and reason == f"repeats {tmp_path / '1'}: the same settings and seed"
+    assert folder.name == "2" and reason == f"duplicate of {tmp_path / '1'} (same settings and seed)"
 
 
 def test_a_folder_that_is_not_there_is_an_error(tmp_path):
@@ -282,7 +282,7 @@ def test_the_command_writes_tables_and_figures_and_names_what_it_left_out(lp, tm
     write_job(tmp_path / "sweep" / "stopped")
     ran = lp("report", "runs=sweep", "hydra.run.dir=out")
     assert ran.status == 0, ran.err
-    assert "left out: sweep/stopped: unfinished" in ran.out and "paper: gamma 0.3" in ran.out
+    assert "skipped: sweep/stopped: unfinished" in ran.out and "paper: gamma 0.3" in ran.out
     assert "6 runs; metrics over objects with a unique answer" in ran.out
     out = tmp_path / "out"
     assert {"report.md", "report.csv", "report.json", "gamma.png", "gamma.pdf"} <= {each.name for each in out.iterdir()}
@@ -326,8 +326,8 @@ def test_several_folders_are_one_report(lp, tmp_path):
     ("arguments", "sentence"),
     [
         (("runs=nowhere",), "runs=nowhere: there is no such file or folder"),
-        (("runs=empty",), "runs=empty: holds no finished run to report, nor an unfinished one"),
-        (("runs=stopped",), "runs=stopped: holds no finished run to report: stopped/a is unfinished: no res"),
+        (("runs=empty",), "runs=empty: contains no finished run to report"),
+        (("runs=stopped",), "runs=stopped: contains no finished run to report (stopped/a: unfinished: no res"),
         (
             ("runs=good", "objects=unique"),
             "objects=unique does not fit; expected one of unique_answer, all; did you mean 'un",

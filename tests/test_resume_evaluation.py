@@ -189,7 +189,7 @@ def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, 
     said = (
         rf"{name}/{file}: cannot be written \(No space left on device: it needs more than the [\d.]+ MB that are free\)"
     )
-    assert re.fullmatch(f"{said}; make room, then resume={name} resumes it", ran.error)
+    assert re.fullmatch(f"{said}; free some space, then continue with resume={name}", ran.error)
     again = commands.here("unused", "eval", f"resume={name}", "pictures=false")
     assert went_on(again) == (4 * BATCH if place == "journal" else PAIRS)
     again.folder = commands.folder / name
@@ -210,7 +210,7 @@ def test_a_command_that_a_scheduler_ends_says_how_it_goes_on(commands, whole, mo
         patch.setattr(Evaluation, "test_step", ended)
         ran = commands.here("ended", "eval", *EVALUATION)
     signal.signal(signal.SIGINT, interrupt)  # Lightning has switched it off
-    assert (ran.status, ran.err.splitlines()[-1]) == (143, "interrupted; resume=ended resumes it")
+    assert (ran.status, ran.err.splitlines()[-1]) == (143, "interrupted; to continue: resume=ended")
     ran = commands.here("ended", "eval", *EVALUATION)
     assert went_on(ran) == 2 * BATCH
     assert_the_same(ran, whole)
@@ -255,13 +255,13 @@ def test_results_do_not_outlive_the_beginning_of_others(commands, whole, stop):
 def test_another_configuration_is_refused_in_a_sentence_and_nothing_is_lost(commands, stop):
     folder = stop("mixed", 2)
     before = journal(folder).read_bytes()
-    expected = "mixed: holds another unfinished evaluation ({}); give another folder, or remove mixed/unfinished"
+    expected = "mixed: contains another unfinished evaluation ({}); choose another folder or remove mixed/unfinished"
     wrong = commands.here("mixed", "eval", *EVALUATION, "solver.gamma=0.2", "seed=3")
-    assert wrong.error == expected.format("seed is 0 there, 3 here, solver.gamma is [0.0, 0.3, 0.0] there, 0.2 here")
+    assert wrong.error == expected.format("seed was 0, is 3; solver.gamma was [0.0, 0.3, 0.0], is 0.2")
     os.makedirs(commands.folder / "copy", exist_ok=True)
     shutil.copy(commands.folder / "score" / "checkpoints" / "best.ckpt", commands.folder / "copy" / "best.ckpt")
     wrong = commands.here("mixed", "eval", *EVALUATION, "checkpoint=copy")
-    assert wrong.error == expected.format("checkpoint is score/checkpoints/best.ckpt there, copy/best.ckpt here")
+    assert wrong.error == expected.format("checkpoint was score/checkpoints/best.ckpt, is copy/best.ckpt")
     assert journal(folder).read_bytes() == before
     moved = commands.here("mixed", "eval", *EVALUATION, "trainer.devices=1", "trainer.accelerator=cpu")
     assert went_on(moved) == 2 * BATCH
@@ -276,10 +276,8 @@ def test_a_model_that_was_trained_anew_is_refused(commands, stop):
     content["state_dict"][bias] += 1
     torch.save(content, checkpoint)
     try:
-        assert "another unfinished evaluation (other weights)" in commands.here("retrained", "eval", *EVALUATION).error
-        assert (
-            "another unfinished evaluation (other weights)" in commands.here("unused", "eval", "resume=retrained").error
-        )
+        assert "unfinished evaluation (different weights)" in commands.here("retrained", "eval", *EVALUATION).error
+        assert "unfinished evaluation (different weights)" in commands.here("unused", "eval", "resume=retrained").error
     finally:
         checkpoint.write_bytes(kept)
 
@@ -292,7 +290,7 @@ def test_views_that_have_changed_are_refused(commands, stop):
     content["ambiguity"] = "twofold"
     transforms.write_text(json.dumps(content))
     try:
-        assert "redrawn: holds another unfinished evaluation (other views)" in (
+        assert "redrawn: contains another unfinished evaluation (different views)" in (
             commands.here("redrawn", "eval", *EVALUATION).error
         )
     finally:
@@ -311,7 +309,7 @@ def test_what_cannot_be_resumed_is_named(commands, whole, stop):
         "resume=whole: that run is finished; its results are in whole/results.json"
     )
     assert commands.here("unused", "eval", "resume=score").error == (
-        "resume=score: holds no unfinished evaluation to resume; give the folder of one"
+        "resume=score: contains no unfinished evaluation to resume"
     )
     stop("kept", 1)
     assert commands.here("unused", "eval", "resume=kept", "solver.gamma=0").error == (
@@ -325,7 +323,7 @@ def test_a_resumed_run_keeps_its_model_though_a_later_one_is_there(commands, sto
     stop("default", 1, "checkpoint=latest")
     later = shutil.copytree(commands.folder / "score", commands.folder / "runs" / "train" / "later")
     os.utime(later / "checkpoints" / "last.ckpt", (time.time() + 60, time.time() + 60))
-    assert "checkpoint is runs/train/early" in commands.here("default", "eval", *EVALUATION, "checkpoint=latest").error
+    assert "checkpoint was runs/train/early" in commands.here("default", "eval", *EVALUATION, "checkpoint=latest").error
     assert commands.here("unused", "eval", "resume=default").status == 0
     result = json.loads((commands.folder / "default" / "results.json").read_text())
     assert result["checkpoint"] == "runs/train/early/checkpoints/best.ckpt"
@@ -360,9 +358,9 @@ def test_a_journal_gives_back_every_bit(tmp_path):
         for one, two in zip(batch[:-2], wanted[:-2], strict=True):
             assert one.dtype == two.dtype
             torch.testing.assert_close(one, two, rtol=0, atol=0, equal_nan=True)
-    with pytest.raises(UserError, match="other views"):
+    with pytest.raises(UserError, match="different views"):
         Journal(tmp_path, subject).begin("others")
-    with pytest.raises(UserError, match="seed is 0 there, 1 here"):
+    with pytest.raises(UserError, match="seed was 0, is 1"):
         Journal(tmp_path, other).begin("views")
 
 

@@ -13,7 +13,7 @@ import pytest
 from lp_framework.atomic import DiskFull
 from lp_framework.run_folders import Held, held, remove_if_empty
 
-SENTENCE = "another command works in this folder; let it finish, or choose another"
+SENTENCE = "is in use by another command; wait for it, or choose another folder"
 
 
 def test_a_folder_is_one_commands_at_a_time(tmp_path: Path):

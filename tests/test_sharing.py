@@ -95,7 +95,7 @@ def test_a_folder_is_uploaded_under_its_id(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     assert upload(tmp_path, "somebody/model") == "https://huggingface.co/somebody/model"
     assert calls == [("somebody/model", True), ("somebody/model", tmp_path)]
-    with pytest.raises(UserError, match=f"403 Forbidden.*`hf upload somebody/closed {tmp_path}` tries again"):
+    with pytest.raises(UserError, match=f"403 Forbidden.*to retry: `hf upload somebody/closed {tmp_path}`"):
         upload(tmp_path, "somebody/closed")
 
 
@@ -120,7 +120,7 @@ def test_a_shared_model_is_loaded_offline_from_the_hubs_cache(
 def test_the_card_s_settings_belong_to_trainings(lp: Any, tmp_path: Path) -> None:
     ran = lp("convert", f"path={tmp_path}", f"output={tmp_path}/new", "license=mit")
     assert ran.status == 1
-    assert ran.error == f"license belongs to a training run; {tmp_path} is none"
+    assert ran.error == f"license applies only to training runs, and {tmp_path} is not one"
 
 
 def test_loggers_get_the_settings_of_their_choice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -136,8 +136,8 @@ def test_a_sweep_goes_on_with_the_jobs_that_have_no_result(sweep):
     (sweep.folder / "2" / "results.json").write_text("")  # what a power cut may leave
     again = sweep("seed=0,1,2")
     assert again.status == 0
-    skipped = [line for line in again.out.splitlines() if line.startswith("skipped, finished before: ")]
-    assert skipped == [f"skipped, finished before: {sweep.folder.name}/0"]
+    skipped = [line for line in again.out.splitlines() if line.startswith("skipped (already finished): ")]
+    assert skipped == [f"skipped (already finished): {sweep.folder.name}/0"]
     for number in "012":
         assert result(sweep.folder / number)["metrics"] == whole[number]["metrics"]
     assert (sweep.folder / "0" / "results.json").stat().st_mtime_ns == when["0"]
@@ -148,17 +148,17 @@ def test_a_sweep_that_is_started_twice_is_shared(sweep):
     with held(sweep.folder / "1"):  # by the other
         ran = sweep("seed=0,1,2")
     assert ran.status == 0, ran.err
-    assert f"skipped, another command is working on it: {sweep.folder.name}/1" in ran.out.splitlines()
+    assert f"skipped (in use by another command): {sweep.folder.name}/1" in ran.out.splitlines()
     assert [(sweep.folder / number / "results.json").is_file() for number in "012"] == [True, False, True]
     again = sweep("seed=0,1,2")
-    assert again.out.count("skipped, finished before: ") == 2 and (sweep.folder / "1" / "results.json").is_file()
+    assert again.out.count("skipped (already finished): ") == 2 and (sweep.folder / "1" / "results.json").is_file()
 
 
 def test_the_views_of_finished_jobs_are_looked_at_once(sweep, monkeypatch):
     assert sweep("seed=0,1,2").status == 0
     fingerprint, looked = PairDataModule.fingerprint, []
     monkeypatch.setattr(PairDataModule, "fingerprint", lambda *of: looked.append(of) or fingerprint(*of))
-    assert sweep("seed=0,1,2").out.count("skipped, finished before: ") == 3 and len(looked) == 1
+    assert sweep("seed=0,1,2").out.count("skipped (already finished): ") == 3 and len(looked) == 1
 
 
 def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(sweep):
@@ -167,8 +167,8 @@ def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(s
     again = sweep("solver.gamma=0,0.3,0.5")
     assert again.status == 1
     assert (
-        f"{sweep.folder.name}/1: holds other results (solver.gamma is 0.1 there, 0.3 here); "
-        "give another hydra.sweep.dir, or remove it"
+        f"{sweep.folder.name}/1: contains other results (solver.gamma was 0.1, is 0.3); "
+        "choose another hydra.sweep.dir or remove it"
     ) in again.err
     assert (sweep.folder / "1" / "results.json").read_bytes() == before
     assert result(sweep.folder / "2")["config"]["solver"]["gamma"] == 0.5
@@ -176,13 +176,11 @@ def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(s
 
 def test_another_seed_or_another_model_is_another_configuration(sweep, commands):
     assert sweep("seed=3").status == 0
-    assert "seed is 3 there, 4 here" in sweep("seed=4").err
+    assert "seed was 3, is 4" in sweep("seed=4").err
     os.makedirs(commands.folder / "copy", exist_ok=True)
     copy = commands.folder / "copy" / "best.ckpt"
     copy.write_bytes((commands.folder / "score" / "checkpoints" / "best.ckpt").read_bytes())
-    assert (
-        "checkpoint is score/checkpoints/best.ckpt there, copy/best.ckpt here" in sweep("seed=3", "checkpoint=copy").err
-    )
+    assert "checkpoint was score/checkpoints/best.ckpt, is copy/best.ckpt" in sweep("seed=3", "checkpoint=copy").err
 
 
 def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
@@ -191,7 +189,7 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
     kept = checkpoint.stat()
     os.utime(checkpoint, (time.time() + 60, time.time() + 60))
     try:
-        assert "holds other results (score/checkpoints/best.ckpt is newer)" in sweep("seed=0").err
+        assert "contains other results (score/checkpoints/best.ckpt is newer)" in sweep("seed=0").err
     finally:
         os.utime(checkpoint, (kept.st_atime, kept.st_mtime))
     assert "skipped" in sweep("seed=0").out
@@ -203,7 +201,7 @@ def test_results_of_other_views_are_not_taken(sweep, commands):
     kept = image.read_bytes()
     image.write_bytes((image.parent / "001.png").read_bytes())
     try:
-        assert f"{sweep.folder.name}/0: holds other results (other views); give another" in sweep("seed=0").err
+        assert f"{sweep.folder.name}/0: contains other results (different views); choose another" in sweep("seed=0").err
     finally:
         image.write_bytes(kept)
     assert "skipped" in sweep("seed=0").out
@@ -219,7 +217,7 @@ def test_an_experiment_goes_on_in_its_own_folder(commands):
     first = ("experiment=gamma", "solver=langevin", "checkpoint=./score", "seed=0", "solver.gamma=0,0.3")
     assert commands.here("unused", "eval", *first).status == 0
     more = commands.here("unused", "eval", *first[:-2], "seed=0,1", "solver.gamma=0,0.3")
-    assert more.status == 0 and more.out.count("skipped, finished before: ") == 2
+    assert more.status == 0 and more.out.count("skipped (already finished): ") == 2
     below = commands.folder / "runs" / "multirun" / "eval" / "gamma"
     assert len(list(below.rglob("results.json"))) == 4
 
@@ -263,7 +261,7 @@ def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice
     folders = sorted(file.parent for file in (commands.folder / package).rglob("results.json"))
     assert tuple(result(folder)["config"]["solver"]["gamma"] for folder in folders) == (0, 0.3)
     again = commands.here("unused", "eval", *sweep, "solver.gamma=0,0.3")  # in this process, but the same sweep
-    assert again.status == 0 and again.out.count("skipped, finished before: ") == 2
+    assert again.status == 0 and again.out.count("skipped (already finished): ") == 2
 
 
 def test_what_is_asked_of_slurm(tmp_path, monkeypatch):
@@ -296,7 +294,7 @@ def test_a_launcher_that_is_not_installed(lp, monkeypatch, launcher, extra):
     ran = lp("eval", f"hydra/launcher={launcher}", "--cfg", "job")
     name = {"slurm": "submitit_slurm", "ray_cluster": "ray"}.get(launcher, launcher)
     assert ran.error.startswith(f"hydra/launcher={name}: there is no hydra/launcher '{name}'")
-    assert ran.error.endswith(f"; pip install 'lp_framework[{extra}]' brings some")
+    assert ran.error.endswith(f"; for more: pip install 'lp_framework[{extra}]'")
 
 
 # A solver of a plugin.

@@ -201,9 +201,7 @@ def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
     assert [row["val/loss"] for row in every[: len(first)]] == [row["val/loss"] for row in first]
     assert [row["epoch"] for row in every if row["val/loss"]] == ["0", "1", "2"]
     finished = commands.here("finished", "train", "resume=prolonged")  # not up to the default number of epochs
-    assert finished.error == (
-        "prolonged: has done all of its epochs; resume=prolonged trainer.max_epochs=N would prolong it"
-    )
+    assert finished.error == ("prolonged: all epochs are done; to train longer: resume=prolonged trainer.max_epochs=N")
     (commands.folder / "prolonged" / "training.json").unlink()  # as if it had been killed at the very end
     assert commands.here("reported", "train", "resume=prolonged").status == 0
     assert (commands.folder / "prolonged" / "training.json").is_file()
@@ -222,7 +220,7 @@ def test_ctrl_c_says_how_to_go_on(commands, monkeypatch):
         patch.setattr(ScoreModel, "on_train_epoch_start", interrupted)
         ran = commands.here("interrupted", "train", "trainer.max_epochs=2")
     signal.signal(signal.SIGINT, handler)  # Lightning has switched it off
-    assert (ran.status, ran.err.splitlines()[-1]) == (130, "interrupted; resume=interrupted resumes it")
+    assert (ran.status, ran.err.splitlines()[-1]) == (130, "interrupted; to continue: resume=interrupted")
     assert commands.here("unused", "train", "resume=interrupted").status == 0
 
 
@@ -266,7 +264,7 @@ def test_a_second_training_in_a_folder_is_told_so_and_touches_nothing(commands, 
     with held(folder):
         for overrides in ((), ("resume=held", "trainer.max_epochs=4")):
             ran = commands.here("held", "train", *overrides)
-            assert ran.error == "held: another command works in this folder; let it finish, or choose another"
+            assert ran.error == "held: is in use by another command; wait for it, or choose another folder"
     assert (folder / "checkpoints" / "last.ckpt").read_bytes() == weights
     assert commands.here("unused", "train", "resume=held", "trainer.max_epochs=4").status == 0
 
@@ -288,7 +286,7 @@ def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_o
     folder = commands.folder / "filled"
     assert re.fullmatch(
         r"filled/checkpoints/(best|last)\.ckpt: cannot be written \(No space left on device: it needs more than the "
-        r"[\d.]+ MB that are free\); make room, then resume=filled resumes it",
+        r"[\d.]+ MB that are free\); free some space, then continue with resume=filled",
         ran.error,
     )
     assert sorted(each.name for each in (folder / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
@@ -324,9 +322,9 @@ def test_metrics_are_whole_where_the_disk_fills_up(tmp_path, monkeypatch):
 
 def test_the_same_command_goes_on_in_its_folder_and_another_does_not_write_over_it(commands, score):
     weights = score.checkpoint()["state_dict"]
-    assert commands.here("score", "train").error.startswith("score: has done all of its epochs")
+    assert commands.here("score", "train").error.startswith("score: all epochs are done")
     assert commands.here("score", "train", "model=energy").error.startswith(
-        "score: holds a training run with other set"
+        "score: contains a training run with other set"
     )
     assert_equal(score.checkpoint()["state_dict"], weights)
     for missing in ("training.json", "report.html"):  # as a kill or a full disk leaves it
@@ -338,7 +336,7 @@ def test_the_same_command_goes_on_in_its_folder_and_another_does_not_write_over_
 
 def test_a_training_that_diverges_is_an_error_and_its_model_is_not_taken(commands, monkeypatch):
     ran = commands.here("runs/train/far", "train", "model.learning_rate=1e30", "trainer.max_epochs=1")
-    assert ran.status == 1 and re.search(r"error: .*far: the training has diverged \(.*loss.*: not finite\)", ran.err)
+    assert ran.status == 1 and re.search(r"error: .*far: training diverged \(not finite: .*loss.*\)", ran.err)
     monkeypatch.chdir(commands.folder)
     with pytest.raises(UserError, match="checkpoint=latest: there is no training run of a model in "):
         find_checkpoint("latest")
@@ -369,7 +367,7 @@ def test_a_damaged_configuration_is_named(commands, score, content):
 def test_resuming_what_is_not_there_is_named(commands):
     for folder, said in (
         ("nowhere", "there is no such file or folder"),
-        ("views", "holds no checkpoints/last.ckpt to go on from"),
+        ("views", "contains no checkpoints/last.ckpt to resume from"),
     ):
         assert commands.here("nothing", "train", f"resume={folder}").error.startswith(f"resume={folder}: {said}")
         assert not (commands.folder / "nothing").exists()
@@ -433,7 +431,7 @@ def test_a_checkpoint_of_the_hub_is_fetched_by_its_id(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     assert find_checkpoint("somebody/model") == tmp_path / "model.safetensors"
     assert asked == [("somebody/model", ["model.json", "model.safetensors"])]
-    with pytest.raises(UserError, match="checkpoint=somebody/nothing: is neither a file or folder nor on the hub"):
+    with pytest.raises(UserError, match="checkpoint=somebody/nothing: is neither a file, a folder nor on the hub"):
         find_checkpoint("somebody/nothing")
     (tmp_path / "runs").mkdir()
     assert find_checkpoint("runs/nothing") == Path("runs/nothing")  # a path whose folder is here asks nobody

@@ -460,7 +460,7 @@ def test_the_convert_command(lp, checkpoint, networks, tmp_path):
     assert finished.status == 0, finished.err
     assert "prior.path=converted" in finished.out
     assert same(assemble("converted", *read_folder(tmp_path / "converted"), "float32"), networks)
-    assert "exists already" in lp("convert", f"path={checkpoint}", "output=converted").error
+    assert "already exists" in lp("convert", f"path={checkpoint}", "output=converted").error
     assert "did you mean 'raw'?" in lp("convert", f"path={checkpoint}", "output=other", "weights=row").error
     assert "path needs a value" in lp("convert", "output=other").error
     missing = lp("convert", "path=absent.ckpt", "output=other").error

@@ -161,10 +161,10 @@ def resumable(folder: Path, kept: str) -> Iterator[None]:
     except (KeyboardInterrupt, SystemExit, DiskFull) as error:  # Lightning exits after an interruption
         saved = any((folder / kept).glob("*"))
         if not isinstance(error, DiskFull):
-            raise KeyboardInterrupt(f"interrupted; resume={folder} resumes it" if saved else "interrupted") from error
+            raise KeyboardInterrupt(f"interrupted; to continue: resume={folder}" if saved else "interrupted") from error
         if not saved:
             raise
-        raise DiskFull(f"{error}; make room, then resume={folder} resumes it") from error
+        raise DiskFull(f"{error}; free some space, then continue with resume={folder}") from error
 
 
 def with_overrides(previous: DictConfig, config: DictConfig, changeable: tuple[str, ...], saved: Path) -> DictConfig:

@@ -23,13 +23,12 @@ CARD_SETTINGS = ("results", "license", "hub")  # settings for models that are sh
 def run(config: DictConfig) -> None:
     """Read `path` (with `weights` and `dtype`) and write the folder `output`, for use as `prior.path`.
 
-    Of the training run of a pose model, `output` is for use as `checkpoint`; it gets a model card if the run has all of
-    its records.
+    For the training run of a pose model, `output` is for use as `checkpoint`, with a model card if the run is complete.
     """
     registry.checked(load_networks, {"weights": config.weights, "dtype": config.dtype}, "")
     output = Path(config.output)
     if output.exists():
-        raise UserError(f"output={output}: exists already; give another folder or remove it")
+        raise UserError(f"output={output}: already exists; choose another folder or remove it")
     run_folder = Path(config.path)
     if (run_folder / FOLDER).is_dir():
         card = _card(run_folder, config)
@@ -42,13 +41,13 @@ def run(config: DictConfig) -> None:
         return
     for key in CARD_SETTINGS:
         if config[key] is not None:
-            raise UserError(f"{key} belongs to a training run; {run_folder} is none")
+            raise UserError(f"{key} applies only to training runs, and {run_folder} is not one")
     write_folder(load_networks(config.path, config.revision, config.weights, config.dtype), output)
     print(f"converted: {output} (use it with prior.path={output})")
 
 
 def _card(run_folder: Path, config: DictConfig) -> str | None:
-    """The model card; none, with a warning, of an unfinished run for which nobody requested for one."""
+    """The model card; None, with a warning, if the run is unfinished and no setting requests a card."""
     requested = any(config[key] is not None for key in CARD_SETTINGS)
     try:
         return model_card(run_folder, config.hub or Path(config.output).name, config.license, config.results)
@@ -66,6 +65,6 @@ def upload(folder: Path, hub_id: str) -> str:
         address = hub.create_repo(hub_id, exist_ok=True)
         hub.upload_folder(repo_id=hub_id, folder_path=folder)
     except (OSError, ValueError) as error:  # base classes of the hub's errors
-        again = f"{folder} is written; `hf upload {hub_id} {folder}` tries again"
+        again = f"{folder} is written; to retry: `hf upload {hub_id} {folder}`"
         raise UserError(f"hub={hub_id}: the upload failed ({one_line(error)}); {again}") from error
     return str(address)

@@ -114,8 +114,8 @@ def is_finished(folder: Path, subject: Mapping[str, Any]) -> bool:
     if not changed and checkpoint is not None and Path(checkpoint).stat().st_mtime > file.stat().st_mtime:
         changed = f"{checkpoint} is newer"
     if changed:
-        raise UserError(f"{folder}: holds other results ({changed}); give another hydra.sweep.dir, or remove it")
-    print(f"skipped, finished before: {folder}")
+        raise UserError(f"{folder}: contains other results ({changed}); choose another hydra.sweep.dir or remove it")
+    print(f"skipped (already finished): {folder}")
     return True
 
 
@@ -133,7 +133,7 @@ def unfinished_evaluation(folder: Path, config: DictConfig) -> tuple[DictConfig,
     if subject is None and (folder / RESULT).is_file():
         raise UserError(f"resume={folder}: that run is finished; its results are in {folder / RESULT}")
     if subject is None:
-        raise UserError(f"resume={folder}: holds no {journal.FOLDER} evaluation to resume; give the folder of one")
+        raise UserError(f"resume={folder}: contains no {journal.FOLDER} evaluation to resume")
     previous = OmegaConf.create(subject["config"])
     checkpoint = Path(subject["checkpoint"]) if subject["checkpoint"] else None
     return building.with_overrides(previous, config, journal.MOVABLE, folder / journal.FOLDER), checkpoint

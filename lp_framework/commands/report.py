@@ -27,8 +27,8 @@ def run(config: DictConfig) -> None:
     tables, unlabelled = sweep_tables(found, objects)
     left_out += unlabelled
     if not tables and all(kind == "eval" for _, kind in runs):
-        reason = f": {left_out[0].folder} is {left_out[0].reason}" if left_out else ", nor an unfinished one"
-        raise UserError(f"runs={', '.join(map(str, folders))}: holds no finished run to report{reason}")
+        reason = f" ({left_out[0].folder}: {left_out[0].reason})" if left_out else ""
+        raise UserError(f"runs={', '.join(map(str, folders))}: contains no finished run to report{reason}")
     folder = run_folder()
     console = Console(width=10_000 if not Console().is_terminal else None, highlight=False)
     console.print(f"{len(runs)} runs" + (f"; {metrics_note(objects)}" if tables else ""))
@@ -42,7 +42,7 @@ def run(config: DictConfig) -> None:
             console.print(f"paper: {note}", style="dim", soft_wrap=True)
     console.print()
     for path, reason in left_out:
-        console.print(f"left out: {path}: {reason}", style="yellow", soft_wrap=True)
+        console.print(f"skipped: {path}: {reason}", style="yellow", soft_wrap=True)
     page = write_report_page(folder / PAGE, runs, sweep_sections(sweeps, left_out))
     if sweeps:
         write_sweeps(folder, sweeps, left_out, objects, {"config": plain(config), "versions": versions()})

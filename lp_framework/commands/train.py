@@ -1,4 +1,4 @@
-"""`train`: fit a model of the relative pose; `resume=RUN_FOLDER` resumes a killed run."""
+"""`train`: fit a model of the relative pose; `resume=RUN_FOLDER` resumes an interrupted run."""
 
 from __future__ import annotations
 
@@ -41,13 +41,15 @@ def run(config: DictConfig) -> None:
     resuming = last.is_file()
     if config.resume is not None:
         if not resuming:
-            raise UserError(f"resume={folder}: holds no {FOLDER}/{LAST} to go on from; give a training run's folder")
+            raise UserError(
+                f"resume={folder}: contains no {FOLDER}/{LAST} to resume from; give the folder of a training run"
+            )
         # A run may be extended or moved to other devices.
         config = building.with_overrides(OmegaConf.create(saved_config(saved)), config, ("trainer",), saved)
     elif resuming and saved_config(saved) != building.plain(config):  # never overwrite another training
         raise UserError(
-            f"{folder}: holds a training run with other settings; resume={folder} resumes it, or give another "
-            "hydra.run.dir for this one"
+            f"{folder}: contains a training run with other settings; resume it with resume={folder}, or choose another "
+            "hydra.run.dir"
         )
     settings = building.plain(config)
     _check(settings)
@@ -56,11 +58,9 @@ def run(config: DictConfig) -> None:
         reported = all((folder / name).is_file() for name in (building.TRAINING, PAGE))
         if epochs is not None and 0 < epochs <= checkpoint["epoch"] + 1 and reported:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                print(f"skipped, finished before: {folder}")
+                print(f"skipped (already finished): {folder}")
                 return
-            raise UserError(
-                f"{folder}: has done all of its epochs; resume={folder} trainer.max_epochs=N would prolong it"
-            )
+            raise UserError(f"{folder}: all epochs are done; to train longer: resume={folder} trainer.max_epochs=N")
     building.seed_run(settings["seed"])
     components = building.Components(settings)
     data, model = components["data"], components["model"]
@@ -86,7 +86,7 @@ def _check(settings: Mapping[str, Any]) -> None:
     if ema is not None and not (isinstance(ema, int | float) and 0 <= ema <= 1):
         raise UserError(f"ema must be a share from 0 to 1, or null for none; got {ema}")
     if patience is not None and not (isinstance(patience, int) and patience >= 0):
-        raise UserError(f"patience must be a number of epochs, or null for no early stop; got {patience}")
+        raise UserError(f"patience must be a number of epochs, or null for no early stopping; got {patience}")
 
 
 def chosen_callbacks(settings: Mapping[str, Any], folder: Path) -> list[callbacks.Callback]:
@@ -181,7 +181,7 @@ def report(trainer: Trainer, folder: Path, settings: Mapping[str, Any], data: Pa
          "versions": building.versions()},
     )  # fmt: skip
     if diverged := ", ".join(sorted({*losses} - {*finite})):
-        raise UserError(f"{folder}: the training has diverged ({diverged}: not finite); lower model.learning_rate")
+        raise UserError(f"{folder}: training diverged (not finite: {diverged}); lower model.learning_rate")
     console = Console(soft_wrap=True, highlight=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
     console.print(f"model:   {folder / FOLDER / BEST}")

@@ -101,8 +101,8 @@ def lines(details: Mapping[str, Any]) -> list[str]:
     best_of = ", ".join(f"{row['starts']}: {rates(row)}" for row in details["best_of"])
     low, high = details["interval"]["R(R)@30"]
     text = [
-        f"unique answer, {details['pairs']} pairs, R(R)@15/R(R)@30 by difference of longitude: {by_longitude}",
-        f"  the best of the first starts, {best_of}; R(R)@30 of other objects (95%): {low:.2f} to {high:.2f}",
+        f"unique answer, {details['pairs']} pairs, R(R)@15/R(R)@30 by longitude difference: {by_longitude}",
+        f"  best of the first starts, {best_of}; 95% interval of R(R)@30 over objects: {low:.2f} to {high:.2f}",
     ]
     if details["calibration"]:
         mean, gap = details["calibration"]["mean_probability"], details["calibration"]["error"]

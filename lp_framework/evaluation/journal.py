@@ -96,8 +96,8 @@ def to_resume(folder: Path, subject: Mapping[str, Any]) -> dict[str, Any] | None
     changed = "" if before is None else changes(before, subject)
     if changed and any((folder / FOLDER).glob("rank_*.jsonl")):
         raise UserError(
-            f"{folder}: holds another unfinished evaluation ({changed}); "
-            f"give another folder, or remove {folder / FOLDER}"
+            f"{folder}: contains another unfinished evaluation ({changed}); "
+            f"choose another folder or remove {folder / FOLDER}"
         )
     return None if changed else before
 
@@ -108,15 +108,15 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     Keys missing from `now` count as unchanged, and a setting missing on one side counts as off there.
 
     >>> changes({"config": {"seed": 1, "solver": {"gamma": 0.3}}}, {"config": {"seed": 1, "solver": {"gamma": 0}}})
-    'solver.gamma is 0.3 there, 0 here'
+    'solver.gamma was 0.3, is 0'
     """
     there, here = _compared(before), _compared({**before, **now})
     found = []
     for key in sorted({*there, *here}):
         one, other = there.get(key), here.get(key)
         if one != other and ((key in there and key in here) or one or other):
-            found.append(f"other {key}" if key in ("views", "weights") else f"{key} is {one} there, {other} here")
-    return ", ".join(found[:3])
+            found.append(f"different {key}" if key in ("views", "weights") else f"{key} was {one}, is {other}")
+    return "; ".join(found[:3])
 
 
 def _compared(subject: Mapping[str, Any]) -> dict[str, Any]:

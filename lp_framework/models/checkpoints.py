@@ -86,10 +86,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"{path}: there is no such checkpoint") from None
     except Exception as error:  # a damaged pickle can raise anything
-        message = f"{path}: is not a readable checkpoint (damaged, or holding more than numbers and text)"
+        message = f"{path}: is not a readable checkpoint (damaged, or contains more than numbers and text)"
         raise UserError(message) from error
     if not isinstance(checkpoint, dict) or not {RECIPE, "state_dict"} <= checkpoint.keys():
-        raise UserError(f"{path}: is a checkpoint of something else; one that `lp train` wrote is wanted")
+        raise UserError(f"{path}: is not a checkpoint written by `lp train`")
     return checkpoint
 
 
@@ -149,7 +149,7 @@ def _in_folder(path: Path) -> Path:
         for name in (BEST, LAST):
             if (folder / name).is_file():
                 return folder / name
-    raise UserError(f"{path}: holds no {FOLDER}/{BEST} or {LAST}; give a run's folder or a checkpoint file")
+    raise UserError(f"{path}: contains no {FOLDER}/{BEST} or {LAST}; give a run's folder or a checkpoint file")
 
 
 def _from_hub(name: str) -> Path:
@@ -157,7 +157,7 @@ def _from_hub(name: str) -> Path:
     try:
         return Path(hub.snapshot_download(name, allow_patterns=[WEIGHTS, CONFIG])) / WEIGHTS
     except (OSError, ValueError) as error:  # the hub's errors derive from these
-        raise UserError(f"checkpoint={name}: is neither a file or folder nor on the hub ({one_line(error)})") from error
+        raise UserError(f"checkpoint={name}: is neither a file, a folder nor on the hub ({one_line(error)})") from error
 
 
 def latest_checkpoint(runs: str | Path = "runs/train") -> Path:
@@ -186,14 +186,14 @@ def load_model(path: str | Path) -> PoseModel:
     file = find_checkpoint(path)
     model = restore(file, read_checkpoint(file))
     if not isinstance(model, PoseModel):
-        raise UserError(f"{file}: holds a prior, not a model of the pose; use it with prior=tiny prior.path={path}")
+        raise UserError(f"{file}: contains a prior, not a pose model; use it with prior=tiny prior.path={path}")
     return model
 
 
 def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
     """Build the trained module in a checkpoint (see `read_checkpoint`); errors mention `file`."""
     try:
-        with expecting("describes no model that can be built"):  # constructors can raise anything for odd values
+        with expecting("describes a model that cannot be built"):  # constructors can raise anything for odd values
             recipe = checkpoint[RECIPE]
             settings = dict(recipe["backbone"])
             if settings.get("pretrained") and not settings.get("frozen"):
@@ -207,5 +207,5 @@ def restore(file: Path, checkpoint: dict[str, Any]) -> TrainedModule:
         model.load_state_dict(checkpoint["state_dict"])
     except Exception as error:  # for tensors of wrong shape or values that are not tensors
         reason = shorten(" ".join(str(error).splitlines()[1:2]), 200, placeholder=" ...")
-        raise UserError(f"{file}: its weights are of another {recipe['model']['name']} model: {reason}") from error
+        raise UserError(f"{file}: its weights do not fit its {recipe['model']['name']} model: {reason}") from error
     return model.eval().requires_grad_(False)

@@ -149,7 +149,7 @@ class TinyPrior(Prior):
         file = find_checkpoint(SHIPPED / "tiny" if path is None else path)
         model = restore(file, read_checkpoint(file))
         if not isinstance(model, PriorModel):
-            raise UserError(f"{file}: holds a model of the pose, not a prior; use it with checkpoint={path}")
+            raise UserError(f"{file}: contains a pose model, not a prior; use it with checkpoint={path}")
         self.model = model
         self.num_timesteps = len(self.model.alphas_cumprod)
         self.latent_shape = (self.model.networks.latent_dim, 1, 1)
