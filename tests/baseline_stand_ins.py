@@ -1,4 +1,4 @@
-"""Stand-ins for what the baselines need from elsewhere: matches, the packages of DUSt3R and VGGT.
+"""Mocks of the external parts of the baselines: matches, and the packages of DUSt3R and VGGT.
 
 They know the view poses that `exact_prior.image_of` has put into the images, and answer in the form of the real ones.
 """
@@ -58,7 +58,7 @@ def known_cameras(images: Tensor) -> Tensor:
 
 
 class KnownNetwork(nn.Module):
-    """What DUSt3R and VGGT are asked for; all lengths are `scale` times the true ones."""
+    """A mock of the networks of DUSt3R and VGGT; all lengths are `scale` times the true ones."""
 
     scale = 1.0
 
@@ -151,7 +151,7 @@ def global_aligner(output: dict[str, dict], device: str, mode: str, verbose: boo
 
 @contextmanager
 def packages() -> Iterator[None]:
-    """The authors' packages can be imported, and are stand-ins."""
+    """Make mocks of the authors' packages importable."""
     contents = {
         "dust3r": {},
         "dust3r.model": {"AsymmetricCroCo3DStereo": KnownNetwork},

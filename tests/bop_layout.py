@@ -44,7 +44,7 @@ def annotation(camera: torch.Tensor) -> tuple[list[float], list[float]]:
 
 
 def write_scene(folder: Path, cameras: list, object_id: int = 1, visible: float = 0.95, suffix: str = ".png") -> None:
-    """A scene with one annotated instance an image, preceded by one of an object of no interest."""
+    """A scene with one annotated instance per image, preceded by an instance of another object."""
     for name in ("rgb", "mask_visib", "mask", "depth"):
         (folder / name).mkdir(parents=True)
     content: dict[str, dict] = {"scene_camera.json": {}, "scene_gt.json": {}, "scene_gt_info.json": {}}

@@ -40,7 +40,7 @@ def in_world(camera: torch.Tensor) -> torch.Tensor:
 
 
 def viewpoint(camera: torch.Tensor, intrinsics: torch.Tensor, isotropic: bool) -> dict:
-    """PyTorch3D's account of a camera of the world: X_camera = X R + T, x left, y up, z forward."""
+    """A camera in PyTorch3D's convention: X_camera = X R + T, x left, y up, z forward."""
     flip = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
     rotation = camera[:3, :3] @ flip
     half = torch.tensor([min(SIZE)] * 2 if isotropic else SIZE, dtype=torch.float64) / 2

@@ -1,4 +1,4 @@
-"""What several tests share: a clean registry, the command line in this process, plugins written on the spot."""
+"""Shared fixtures: a clean registry, the command line in this process, temporary plugins."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from lp_framework import cli, registry, torchvision_ops
 
 torchvision_ops.install()
 Plugins.instance()  # Hydra stores the configs of its own plugins once, too
-torch.set_num_threads(1)  # as have processes that tests start, with whose numbers these are compared to the last bit
-# The same examples everywhere and always; `--hypothesis-profile=default` looks for new ones.
+torch.set_num_threads(1)  # as in subprocesses of tests, so that results are bit-identical
+# The same examples in every run; `--hypothesis-profile=default` searches for new ones.
 settings.register_profile("same", derandomize=True, database=None, deadline=None)
 settings.load_profile("same")
-for group in registry.GROUPS:  # built-ins register once, whatever a test's clean registry forgets
+for group in registry.GROUPS:  # built-ins register only on first import, which must not be inside `clean_registry`
     for package in registry.GROUPS[group]:
         importlib.import_module(package)
 ROOT = Path(__file__).parents[1]
@@ -36,7 +36,7 @@ collect_ignore = ["mock_device.py", "on_mock_device.py"]  # run in a separate pr
 
 @dataclass
 class Finished:
-    """A command that has run: exit status and what it printed."""
+    """A finished command: exit status and output."""
 
     status: int
     out: str
@@ -44,7 +44,7 @@ class Finished:
 
     @property
     def error(self) -> str:
-        """Its one sentence."""
+        """The error message, one sentence."""
         lines = self.err.splitlines()
         assert len(lines) == 1 and lines[0].startswith("error: "), self.err
         return lines[0].removeprefix("error: ")
@@ -52,7 +52,7 @@ class Finished:
 
 @pytest.fixture
 def clean_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a test registers or discovers is forgotten after it."""
+    """Undo what a test registers or discovers."""
     before = set(sys.modules)
     monkeypatch.setattr(registry, "_state", copy.deepcopy(registry._state))
     monkeypatch.setattr(ConfigStore.instance(), "repo", copy.deepcopy(ConfigStore.instance().repo))
@@ -85,7 +85,7 @@ def lp(
 
 @pytest.fixture
 def lp_process(tmp_path: Path) -> Callable[..., Finished]:
-    """The same in a process of its own."""
+    """The same in a subprocess."""
 
     def run(*arguments: str, cwd: Path = tmp_path) -> Finished:
         environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
@@ -99,7 +99,7 @@ def lp_process(tmp_path: Path) -> Callable[..., Finished]:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a training run of a score model in `score` and of an energy model in `energy`, an epoch each."""
+    """A folder with a training run of a score model in `score` and of an energy model in `energy`, one epoch each."""
     commands = Commands(tmp_path_factory.mktemp("trained"))
     folder = tmp_path_factory.mktemp("models")
     for model in ("score", "energy"):

@@ -1,5 +1,5 @@
-"""Damage done to files, for fuzz tests of what reads them: bytes that are cut, turned or replaced, and JSON that is
-well formed but means nothing."""
+"""Damage to files, for fuzz tests of readers: truncated, flipped or replaced bytes, and JSON that is well formed but
+meaningless."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
 
 
-def read_or_told(read: Callable[[], T], *named: Path | str) -> T | None:
+def read_or_reported(read: Callable[[], T], *named: Path | str) -> T | None:
     """What `read` gives, or None where it raises the one exception that it may: a `UserError` in one sentence that
     names the file, or one of several."""
     try:

@@ -8,7 +8,7 @@ from PIL import Image
 
 
 def drawn(width: int = 60, height: int = 40, scale: int = 1) -> NDArray[np.uint8]:
-    """An ellipse `[height, width, 4]` with soft edges on a transparent background; its colours tell place."""
+    """An ellipse `[height, width, 4]` with soft edges on a transparent background; its colours encode the position."""
     y, x = np.mgrid[0:height, 0:width]
     u, v = (x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1
     alpha = np.clip((1 - np.hypot(u, v)) * 8, 0, 1) * 255

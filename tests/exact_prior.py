@@ -1,4 +1,4 @@
-"""A prior whose energy over relative poses is known in closed form, so that solvers are tested against mathematics."""
+"""A prior whose energy over relative poses is known in closed form, to test solvers against exact results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lp_framework.priors.base import Prior, ViewCode
 
 
 class ExactPrior(Prior):
-    """Energy over the offset d = x - (pose of target - pose of source), with the minima asked for:
+    """Energy over the offset d = x - (pose of target - pose of source), with the requested minima:
 
         E(x) = 1/2 s^2 [d_lat^2 + d_rad^2] + 1/2 s^2 prod_k [depth_k + 1 - cos(d_lon - offset_k)]
 

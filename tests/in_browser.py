@@ -1,4 +1,4 @@
-"""A headless Chromium for tests of pages, where there is one."""
+"""A headless Chromium for tests of pages, if installed."""
 
 from __future__ import annotations
 

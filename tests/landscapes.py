@@ -1,4 +1,4 @@
-"""Landscapes in closed form, for the tests of what is found and drawn in them."""
+"""Landscapes in closed form, for tests of minima and plots."""
 
 from __future__ import annotations
 

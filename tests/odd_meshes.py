@@ -1,4 +1,4 @@
-"""Mesh files that are easily read wrong, each beside a plain one that it must look like.
+"""Mesh files that are easily misread, each with a plain one that must look the same.
 
 All show a square in the plane z = 0, one unit wide, with a picture of four colours: red, green in the upper row, blue,
 yellow in the lower one.

@@ -1,4 +1,4 @@
-"""Folders of finished runs of every command with a page, as they are left on disk, made up without models."""
+"""Synthetic folders of finished runs, made without models, for every command that writes a page."""
 
 from __future__ import annotations
 

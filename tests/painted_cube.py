@@ -1,4 +1,4 @@
-"""Photographs of a painted cube by any pinhole camera, drawn by casting a ray a pixel; for tests of converted data.
+"""Photographs of a painted cube by any pinhole camera, drawn by casting one ray per pixel; for tests of converted data.
 
 The cube has side 1, centred at the origin; a point of its surface has the colour 128 + 200 * (x, y, z). So each pixel
 of a photograph, wherever it ends up, tells the point of the object that it shows.

@@ -1,4 +1,4 @@
-"""Folders of finished evaluations as `eval` leaves them, with metrics made up."""
+"""Folders of finished evaluations with synthetic metrics, in the layout of `eval`."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def write_result(
 
 
 def write_job(folder: Path, experiment: str | None = None, command: str = "eval") -> Path:
-    """What Hydra leaves of a job before it has done anything."""
+    """The files that Hydra writes before a job starts."""
     (folder / ".hydra").mkdir(parents=True)
     job = {"hydra": {"job": {"name": command}, "runtime": {"choices": {"experiment": experiment, "data": "toy"}}}}
     OmegaConf.save(OmegaConf.create(job), folder / ".hydra" / "hydra.yaml")

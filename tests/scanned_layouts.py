@@ -1,4 +1,4 @@
-"""Scanned objects as Google Scanned Objects and OmniObject3D are released: a painted box each."""
+"""Scanned objects as Google Scanned Objects and OmniObject3D are released: one painted box each."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from trimesh.visual.material import PBRMaterial
 
 
 def picture(width: int, height: int, waves: float) -> Image.Image:
-    """A smooth, colourful picture whose colours tell place."""
+    """A smooth picture whose colours encode the position."""
     y, x = np.mgrid[0:height, 0:width] / max(width, height)
     colours = np.stack([0.2 + 0.6 * x, 0.2 + 0.6 * y, 0.5 + 0.4 * np.sin(waves * x) * np.cos(waves * y)], axis=-1)
     return Image.fromarray((255 * colours).astype(np.uint8))

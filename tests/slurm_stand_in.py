@@ -1,4 +1,4 @@
-"""Slurm's commands as far as submitit uses them, for machines without Slurm: jobs of an array run at once, here."""
+"""A mock of the Slurm commands that submitit uses; the jobs of an array run immediately on this machine."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SACCT = f"""
 
 
 def install(folder: Path) -> Path:
-    """Write the commands into `folder`, which then goes first in PATH."""
+    """Write the commands into `folder` and prepend it to PATH."""
     folder.mkdir()
     for name, source in (("sbatch", SBATCH), ("srun", SRUN), ("sacct", SACCT)):
         (folder / name).write_text(f"#!{sys.executable}\n{textwrap.dedent(source)}")

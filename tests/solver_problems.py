@@ -1,4 +1,4 @@
-"""Problems whose answers are known, for the tests of solvers: pairs for `ExactPrior`, and models that fit them."""
+"""Problems with known answers, for tests of solvers: pairs for `ExactPrior`, and matching models."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class ExactModel:
 
 
 class FailingPrior(ExactPrior):
-    """Its energies, or only their gradients, are not numbers where a latitude is further than `limit` from 0."""
+    """Energies, or only their gradients, are NaN where a latitude is further than `limit` from 0."""
 
     def __init__(self, limit: float, what: Literal["energy", "gradient"] = "energy") -> None:
         super().__init__()

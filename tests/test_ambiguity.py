@@ -18,7 +18,7 @@ HALF, THIRD = math.pi, 2 * math.pi / 3
 
 
 class Turned(ExactPrior):
-    """A body of revolution: no longitude is better than another, but for `ripple`."""
+    """A body of revolution: apart from `ripple`, the energy does not depend on the longitude."""
 
     def __init__(self, ripple: float) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic file writing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lp_framework.atomic import DiskFull, written
 from lp_framework.errors import UserError
 
 
-def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
+def test_a_file_appears_only_when_complete(tmp_path: Path):
     file = tmp_path / "a.txt"
     with written(file) as partial:
         partial.write_text("new")
@@ -31,7 +31,7 @@ def test_a_file_is_there_once_it_is_whole(tmp_path: Path):
         (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), r"a\.txt: cannot be written \(Permission denied\)"),
     ],
 )  # fmt: skip
-def test_a_file_that_cannot_be_finished_stays_as_it_was(error: BaseException, message: str, tmp_path: Path):
+def test_a_failed_write_leaves_the_file_unchanged(error: BaseException, message: str, tmp_path: Path):
     file = tmp_path / "a.txt"
     file.write_text("old")
     full = isinstance(error, OSError) and error.errno != errno.EACCES

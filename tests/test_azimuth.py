@@ -1,4 +1,4 @@
-"""The energy around an object: where its least is, its profile, its minima."""
+"""The energy around an object: its lowest azimuth, profile and minima."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def scanned(prior: ExactPrior, count: int = 6) -> tuple[torch.Tensor, torch.Tens
     return azimuth_energies(prior, pairs, poses, AZIMUTHS, Draws([100, 900], 2, seed=0)), poses[:, 1]
 
 
-def test_the_energy_is_least_at_the_truth_and_known_elsewhere():
+def test_the_energy_has_its_minimum_at_the_truth_and_a_closed_form():
     energies, truth = scanned(ExactPrior())
     assert within(energies, AZIMUTHS, truth).all()
     # With all but the longitude true the closed form is (1 - cos d) / 2.
     torch.testing.assert_close(energies, (1 - (AZIMUTHS - truth[:, None]).cos()) / 2, atol=1e-5, rtol=1e-4)
 
 
-def test_a_wrong_prior_is_found_out():
+def test_a_wrong_prior_is_detected():
     energies, truth = scanned(ExactPrior(offsets=(math.pi / 2,)))
     assert not within(energies, AZIMUTHS, truth).any()
 
@@ -53,7 +53,7 @@ def test_the_minima_of_a_wave_are_counted(waves, phase):
     assert len(curve.minima()) == waves
 
 
-def test_a_dent_is_no_minimum_and_a_flat_profile_has_no_relief():
+def test_shallow_dips_are_no_minima_and_a_flat_profile_has_no_relief():
     degrees = torch.arange(-180.0, 180.0, 15.0)
     dented = Profile(degrees, 2 - degrees.deg2rad().cos() - 0.05 * (degrees == 120))
     assert [minimum["degrees"] for minimum in dented.minima()] == [0.0]

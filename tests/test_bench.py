@@ -1,4 +1,4 @@
-"""`bench`: contenders do the work that they are said to do, and what has been measured is kept."""
+"""`bench`: the contenders do the stated work, and measurements are saved."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_both_contenders_descend_the_same_energy(priors, images, pairs):
     torch.testing.assert_close(slopes[0], slopes[1], rtol=0, atol=1e-4 * slopes[0].abs().max().item())
 
 
-def test_a_batched_step_encodes_nothing_and_passes_the_network_once(priors, pairs):
+def test_a_batched_step_encodes_no_image_and_calls_the_network_once(priors, pairs):
     ready = encoded(priors[0], priors[0].encode(pairs.images))
     starts = Ring(3).make(pairs, seed=0)
     with Passes(priors[0]) as counts:
@@ -133,7 +133,7 @@ def test_a_batched_step_encodes_nothing_and_passes_the_network_once(priors, pair
     assert ((moved - starts).abs().amax(dim=-1) > 0).all()
 
 
-def test_a_step_of_the_plain_loop_encodes_every_image_anew(priors, images):
+def test_a_step_of_the_plain_loop_encodes_every_image_again(priors, images):
     _, loop_prior = priors
     loop = PlainLoop(loop_prior, images, torch.tensor([0.0, torch.pi / 2, 0.0]))
     torch.testing.assert_close(loop.poses(loop.twist).detach(), torch.tensor([0.0, torch.pi / 2, 0.0]))
@@ -159,7 +159,7 @@ def test_the_contenders_share_memory_only_where_nothing_is_converted(networks):
 
 @pytest.fixture
 def steps(monkeypatch):
-    """What the contenders do, instead of which nothing is done."""
+    """Records the work of the contenders instead of doing it."""
     done = []
 
     def longitude(loop):
@@ -237,7 +237,7 @@ def test_contenders_take_turns_after_a_warm_up(monkeypatch):
 
 
 class Allocator:
-    """A GPU's, of which this machine has none: what `torch.cuda` says of it."""
+    """A mock of the GPU allocator's statistics in `torch.cuda`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = self.most = 1000
@@ -254,7 +254,7 @@ class Allocator:
         self.most = max(self.most, self.now + 30)
 
 
-def test_a_gpus_memory_is_what_its_allocator_says(monkeypatch):
+def test_gpu_memory_is_that_of_the_allocator(monkeypatch):
     allocator, gpu = Allocator(monkeypatch), torch.device("cuda")
     allocator.most = 5000  # of what was before
     assert peak_bytes(allocator.step, torch.nn.Linear(3, 2), gpu) == 30 + 4 * (6 + 2)
@@ -270,7 +270,7 @@ def pose_model():
     return registry.build("model", {"name": "score", "hidden": 16}, backbone=backbone).eval()
 
 
-def test_training_on_features_kept_is_training_on_both_images_of_every_pair(views, pose_model):
+def test_training_on_cached_features_equals_training_on_the_images(views, pose_model):
     pairs = views.table.pairs("ordered")[::5]
     once = views[pairs]
     batches = [views[pair[None]] for pair in pairs]
@@ -289,7 +289,7 @@ def test_training_on_features_kept_is_training_on_both_images_of_every_pair(view
     assert len(once.images) < 2 * len(pairs)
 
 
-def test_the_first_stage_as_a_loop_ends_where_the_batch_does(pose_model):
+def test_the_plain_loop_of_the_first_stage_matches_the_batch(pose_model):
     solver = Langevin(pose_model, gamma=0.0, iterations=5)
     pairs = all_pairs(32, 3, CPU)
     assert len(pairs) == 6 and len(pairs.images) == 3
@@ -303,7 +303,7 @@ def test_the_first_stage_as_a_loop_ends_where_the_batch_does(pose_model):
 # ---------------------------------------------------------------- Adam and Gauss-Newton
 
 
-def test_a_prior_whose_images_are_encoded_has_the_same_energy_and_gradient():
+def test_a_prior_with_precomputed_codes_has_the_same_energy_and_gradient():
     pairs, true = exact_pairs(3)
     prior = ExactPrior([0.0, 2.0], [0.0, 0.3], noisy=0.3)
     found = []
@@ -317,7 +317,7 @@ def test_a_prior_whose_images_are_encoded_has_the_same_energy_and_gradient():
         assert torch.equal(one, other)
 
 
-def test_a_descent_is_followed_on_a_probe_of_its_own():
+def test_a_descent_is_evaluated_on_separate_probe_noise():
     pairs, true = exact_pairs(3)
     starts, prior = around(true, 0.3, -0.4), ExactPrior()
     newton = GaussNewton(ExactModel(), prior, refinement_steps=4, trajectory=True)
@@ -346,7 +346,7 @@ def coloured_box():
     return box
 
 
-def test_a_mesh_that_is_loaded_each_time_looks_the_same(tmp_path):
+def test_reloading_the_mesh_gives_the_same_views(tmp_path):
     coloured_box().export(tmp_path / "box.glb")
     cameras = rendering.around(3)
     one, other = (
@@ -359,7 +359,7 @@ def test_a_mesh_that_is_loaded_each_time_looks_the_same(tmp_path):
 # ---------------------------------------------------------------- a pair
 
 
-def test_a_pair_is_encoded_once_here_and_at_every_step_of_the_loop(priors, monkeypatch):
+def test_a_pair_is_encoded_once_when_batched_and_at_every_step_of_the_loop(priors, monkeypatch):
     monkeypatch.setattr(Computing, "networks", lambda computing, device: None)
     monkeypatch.setattr(Computing, "prior", lambda computing, networks: priors[0])
     monkeypatch.setattr(zero123, "plain_prior", lambda networks: priors[1])
@@ -391,12 +391,12 @@ def test_variants_by_name(words, settings):
 
 
 @pytest.mark.parametrize("words", ["", "bfloat8", "bfloat16 float16"])
-def test_variants_that_are_none(words):
+def test_invalid_variants(words):
     with pytest.raises(UserError, match=f"precision.variants: '{words}' is not one; give one or more of float32, bfl"):
         variant(words, "narrow", None)
 
 
-def test_the_layout_leaves_the_gradient_and_reduced_precision_nearly():
+def test_layout_keeps_the_gradient_and_reduced_precision_nearly():
     variants = ["channels_last", "bfloat16"]
     measured = section()
     zero123.measure_precision(measured, "narrow", variants, starts=2, rounds=1, steps=1, max_batch=None)
@@ -412,7 +412,7 @@ def overrides(**changed):
     return [f"{key}={value}" for key, value in {**NARROW, **changed}.items()]
 
 
-def test_a_run_that_is_stopped_keeps_what_it_has(lp, tmp_path, monkeypatch):
+def test_an_interrupted_run_keeps_its_results(lp, tmp_path, monkeypatch):
     solve, twos = IFusion.solve, []
 
     def stopped(self, pairs, starts, seed):
@@ -503,7 +503,7 @@ def test_mistakes(lp, setting, sentence):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-def test_what_wants_a_gpu_is_refused_without_one(lp, tmp_path):
+def test_measurements_that_need_a_gpu_are_refused_without_one(lp, tmp_path):
     ran = lp("bench", "experiment=gpu", "hydra.run.dir=run")
     assert ran.status == 1 and ran.error.startswith("accelerator=cuda is not available on this machine")
     assert not (tmp_path / "run" / "bench.json").exists()

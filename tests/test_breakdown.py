@@ -1,4 +1,4 @@
-"""Where an evaluation's rates come from, against counts by hand and a calibration that is known."""
+"""Breakdown of an evaluation's rates, against counts by hand and a known calibration."""
 
 import math
 from types import SimpleNamespace
@@ -49,7 +49,7 @@ def test_objects_without_a_unique_answer_are_left_out_and_unlabelled_ones_are_no
     assert breakdown(several, table(False, False, False)) == {}
 
 
-def test_the_interval_is_that_of_other_objects_not_of_other_pairs():
+def test_the_interval_resamples_objects_not_pairs():
     """Ten objects of 50 pairs, half of them always right: as uncertain as ten draws of a coin."""
     objects = np.repeat(np.arange(10), 50)
     error = np.where(objects < 5, 5.0, 90.0)[:, None].tolist()
@@ -58,7 +58,7 @@ def test_the_interval_is_that_of_other_objects_not_of_other_pairs():
     assert low == pytest.approx(0.2, abs=0.05) and high == pytest.approx(0.8, abs=0.05)  # binomial, 10 draws
 
 
-def test_honest_probabilities_are_calibrated_and_boasts_are_not():
+def test_calibrated_and_overconfident_probabilities():
     random = np.random.default_rng(0)
     probability = random.uniform(size=20_000)
     right = random.uniform(size=20_000) < probability

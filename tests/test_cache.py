@@ -22,7 +22,7 @@ TRUTH = np.arange(105, dtype=np.float32).reshape(SHAPE)
 
 
 class Fill:
-    """Gives the truth, in two blocks, and counts how often."""
+    """Computes the expected array in two blocks and counts the calls."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -40,7 +40,7 @@ def fill() -> Fill:
 
 @pytest.fixture
 def array(tmp_path, fill):
-    """`array()` asks the cache for the truth."""
+    """`array()` requests the expected array from the cache."""
     return lambda: cached_array(tmp_path / "cache", "key", len(TRUTH), fill)
 
 
@@ -90,7 +90,7 @@ def test_arrays_of_any_shape_and_type_are_kept(tmp_path, shape, dtype):
         assert kept.shape == (4, *shape) and kept.dtype == dtype and kept.all()
 
 
-def test_another_number_of_rows_under_the_key_is_made_anew(array, tmp_path):
+def test_an_array_with_another_number_of_rows_is_recomputed(array, tmp_path):
     array()
     wider = cached_array(tmp_path / "cache", "key", 2, lambda: [np.full((2, 9), 7, np.uint8)])
     assert wider.shape == (2, 9) and wider.dtype == np.uint8 and (wider == 7).all()
@@ -106,7 +106,7 @@ def note(tmp_path: Path) -> Path:
     return tmp_path / "cache" / "key.json"
 
 
-def test_a_cut_array_is_noticed_at_every_length(array, fill, tmp_path):
+def test_a_truncated_array_is_detected_at_every_length(array, fill, tmp_path):
     array()
     whole = npy(tmp_path).read_bytes()
     for length in {0, 1, 5, 6, 9, 10, 60, 127, 128, 129, len(whole) // 2, len(whole) - 1}:
@@ -116,7 +116,7 @@ def test_a_cut_array_is_noticed_at_every_length(array, fill, tmp_path):
         assert fill.calls == before + 1, length
 
 
-def test_any_altered_byte_of_the_data_is_noticed_and_of_the_header_does_no_harm(array, fill, tmp_path):
+def test_altered_bytes_are_detected_in_the_data_and_harmless_in_the_header(array, fill, tmp_path):
     array()
     whole = npy(tmp_path).read_bytes()
     header = len(whole) - TRUTH.nbytes
@@ -133,7 +133,7 @@ def test_any_altered_byte_of_the_data_is_noticed_and_of_the_header_does_no_harm(
     "text",
     [None, "", "{", "garbage", "[]", "3", "null", "{}", '{"shape": 3, "dtype": 4, "checksum": "5"}', "[" * 99999],
 )
-def test_a_missing_or_damaged_note_is_made_anew(array, fill, tmp_path, text):
+def test_a_missing_or_damaged_record_is_recomputed(array, fill, tmp_path, text):
     array()
     note(tmp_path).unlink()
     if text is not None:
@@ -143,7 +143,7 @@ def test_a_missing_or_damaged_note_is_made_anew(array, fill, tmp_path, text):
     assert fill.calls == 2
 
 
-def test_what_is_not_an_array_is_made_anew(array, fill, tmp_path):
+def test_a_file_that_is_not_an_array_is_recomputed(array, fill, tmp_path):
     array()
     for content in (b"PK\x03\x04 a zip file", b"\x80\x04 a pickle", b"text"):
         npy(tmp_path).write_bytes(content)
@@ -153,7 +153,7 @@ def test_what_is_not_an_array_is_made_anew(array, fill, tmp_path):
     assert fill.calls == 5
 
 
-def test_leftovers_of_a_killed_run_are_no_hindrance(array, fill, tmp_path):
+def test_leftovers_of_a_killed_run_are_ignored(array, fill, tmp_path):
     (tmp_path / "cache").mkdir()
     (tmp_path / "cache" / "key.partial.npy").write_bytes(b"half an array")
     (tmp_path / "cache" / "key.partial.json").write_text("half a no")
@@ -240,7 +240,7 @@ def test_a_folder_that_cannot_be_made(tmp_path, fill):
 
 
 def process(tmp_path: Path, fill_body: str) -> subprocess.Popen:
-    """A process that asks for the truth with a fill of its own and prints the sum."""
+    """A process that requests the array with its own fill function and prints the sum."""
     code = f"""
         import os, signal, time
         import numpy as np
@@ -272,7 +272,7 @@ def test_processes_that_want_the_same_array_fill_it_once(tmp_path, array, fill):
 
 
 @pytest.mark.heavy
-def test_a_process_killed_while_it_fills_is_no_harm(tmp_path, array, fill):
+def test_killing_a_process_that_fills_the_cache_is_harmless(tmp_path, array, fill):
     killed = process(tmp_path, "os.kill(os.getpid(), signal.SIGKILL)")
     assert killed.wait(timeout=60) == -signal.SIGKILL
     killed.communicate()
@@ -299,7 +299,7 @@ def test_keys_follow_the_content_not_the_place(tmp_path, files):
     assert content_key(copies, "views", 16) != key
 
 
-def test_a_file_that_has_gone_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(UserError, match=r"gone\.png: cannot be read \(No such file"):
         content_key([tmp_path / "gone.png"])
 
@@ -323,7 +323,7 @@ def test_the_same_images_elsewhere_are_not_decoded_again(files, tmp_path, opened
     assert len(opened) == len(files)
 
 
-def test_one_changed_pixel_is_decoded_anew(files, tmp_path):
+def test_a_changed_pixel_is_decoded_again(files, tmp_path):
     key, first = decoded_views(files, 16, tmp_path / "cache")
     pixels = np.array(Image.open(files[3]))
     pixels[8, 8, 0] ^= 1
@@ -344,7 +344,7 @@ def test_composition_over_white_is_exact(tmp_path, alpha):
     np.testing.assert_array_equal(images[0], np.round(exact))
 
 
-def test_other_modes_are_read_as_what_they_show(tmp_path):
+def test_other_image_modes_are_converted(tmp_path):
     grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
     image = Image.fromarray(grey)
     files = [tmp_path / f"{mode}.png" for mode in ("L", "RGB", "LA", "P")]
@@ -378,7 +378,7 @@ def test_a_transparent_pixels_colour_does_not_bleed_into_smaller_views(tmp_path)
 
 
 @pytest.mark.parametrize("crop", [False, True])
-def test_views_that_were_decoded_otherwise_are_not_taken_but_their_content_is_the_same(tmp_path, monkeypatch, crop):
+def test_views_decoded_differently_are_not_reused_but_their_content_key_is_the_same(tmp_path, monkeypatch, crop):
     pixels = np.zeros((64, 64, 4), np.uint8)
     pixels[20:40, 10:50] = (200, 0, 0, 255)
     Image.fromarray(pixels).save(tmp_path / "view.png")
@@ -393,7 +393,7 @@ def test_views_that_were_decoded_otherwise_are_not_taken_but_their_content_is_th
     assert (wrong == 0).all() and right.max() == 255 and again == key
 
 
-def test_16_bit_views_that_were_decoded_otherwise_are_not_taken(tmp_path, monkeypatch):
+def test_16_bit_views_decoded_differently_are_not_reused(tmp_path, monkeypatch):
     levels = np.arange(256, dtype=np.uint16).reshape(16, 16) * 257
     Image.fromarray(levels).save(tmp_path / "view.png")
     with monkeypatch.context() as patch:

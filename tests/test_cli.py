@@ -26,7 +26,7 @@ DEMO = ("train", "-cd", "configs", "-cn", "demo")
 
 @pytest.fixture
 def jobs(walker, monkeypatch):
-    """What the command `train` was run with, `(config, argv)` a job; gamma above 1 is bad input, steps of 0 a bug."""
+    """What the command `train` was run with, `(config, argv)` per job; gamma above 1 is bad input, steps of 0 a bug."""
     jobs = []
 
     def run(config):
@@ -166,7 +166,7 @@ def test_a_folder_that_cannot_be_made_is_named(lp, walker, write, jobs, folder):
 
 
 @pytest.mark.parametrize("command", ["train", "eval"])
-def test_so_does_one_that_only_sets_what_another_command_has(lp, command):
+def test_an_experiment_with_settings_of_another_command_names_it(lp, command):
     """`train` has a backbone without the setting, `eval` none at all."""
     finished = lp(command, "experiment=gpu")
     assert finished.status == 2
@@ -219,7 +219,7 @@ def test_a_saved_config_holds_names_and_numbers_only(lp, jobs, walker):
     assert "_target_" not in text and "tmp_walker" not in text and "!!" not in text
 
 
-def test_bad_input_met_while_running_is_one_sentence_and_leaves_no_folder_with_nothing_in_it(lp, jobs, walker):
+def test_bad_input_at_run_time_is_one_sentence_and_leaves_no_empty_folder(lp, jobs, walker):
     finished = lp(*DEMO, "solver.gamma=2")
     assert finished.status == 1 and finished.error == "gamma is 2, it must not exceed 1"
     assert list((walker / "runs" / "demo").iterdir()) == []
@@ -230,7 +230,7 @@ def test_bad_input_met_while_running_is_one_sentence_and_leaves_no_folder_with_n
     assert "gamma is 2, it must not exceed 1" in (walker / "mine" / "train.log").read_text()
 
 
-def test_commands_that_begin_in_one_second_have_folders_of_their_own(lp, jobs, walker):
+def test_commands_started_in_the_same_second_have_separate_folders(lp, jobs, walker):
     for _ in range(5):
         lp(*DEMO)
     assert len(list((walker / "runs" / "demo").iterdir())) == 5
@@ -269,12 +269,12 @@ def test_a_job_that_fails_does_not_stop_a_sweep(lp, jobs, bad, status):
     assert len(jobs) == 3
 
 
-def test_a_command_that_is_stopped_leaves_no_folder_with_nothing_in_it(lp, jobs, walker, monkeypatch):
+def test_an_interrupted_command_leaves_no_empty_folder(lp, jobs, walker, monkeypatch):
     monkeypatch.setattr(sys.modules["lp_framework.commands.train"], "run", lambda _: os.kill(os.getpid(), SIGTERM))
     assert (lp(*DEMO).status, list((walker / "runs" / "demo").iterdir())) == (143, [])
 
 
-def test_what_the_hub_warns_of_is_printed_once(lp, jobs, monkeypatch):
+def test_warnings_of_the_hub_are_printed_once(lp, jobs, monkeypatch):
     hub = logging.getLogger("huggingface_hub")
     monkeypatch.setattr(hub, "propagate", True)
 
@@ -286,7 +286,7 @@ def test_what_the_hub_warns_of_is_printed_once(lp, jobs, monkeypatch):
     assert lp(*DEMO).err.count("Retrying in 1s") == 1
 
 
-def test_a_job_of_a_sweep_does_not_see_the_ranks_of_the_one_before(lp, jobs, monkeypatch):
+def test_a_job_of_a_sweep_does_not_inherit_the_ranks_of_the_previous_one(lp, jobs, monkeypatch):
     seen = []
 
     def run(config):
@@ -334,7 +334,7 @@ def test_a_job_of_a_sweep_does_not_see_the_ranks_of_the_one_before(lp, jobs, mon
         (("train", "-cd", "nowhere"), "Additional config directory '"),
     ],
 )
-def test_a_command_line_that_makes_no_sense(lp, jobs, arguments, sentence):
+def test_invalid_command_lines(lp, jobs, arguments, sentence):
     finished = lp(*arguments)
     assert finished.status == 2
     assert finished.error.startswith(sentence) or sentence in finished.error
@@ -372,7 +372,7 @@ def test_a_setting_without_a_default_has_to_be_given(lp, jobs, walker, monkeypat
 
 
 @pytest.mark.heavy
-def test_a_mistake_in_a_process_of_its_own_leaves_no_traceback(lp_process, walker):
+def test_a_mistake_in_a_subprocess_prints_no_traceback(lp_process, walker):
     finished = lp_process(*DEMO, "solver.gama=1")
     assert finished.status == 2 and "did you mean 'gamma'" in finished.error
 

@@ -92,7 +92,7 @@ def test_the_frame_is_found_from_cameras_and_silhouettes(seen_cameras):
     assert frame.sides.max() == 1 and frame.sides[0] == frame.sides[2]
 
 
-def test_the_frame_is_found_better_from_a_point_cloud_in_spite_of_stray_points(seen_cameras):
+def test_a_point_cloud_with_strays_gives_a_better_frame(seen_cameras):
     cameras, intrinsics, pixels = seen_cameras
     frame = frame_of_points(cameras, box_points())
     torch.testing.assert_close(frame.axes @ frame.axes.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
@@ -108,7 +108,7 @@ def test_the_frame_is_found_better_from_a_point_cloud_in_spite_of_stray_points(s
     assert fitting_views(cameras, intrinsics, pixels, box_points()).all()
 
 
-def test_a_cloud_of_something_else_fits_no_silhouettes(seen_cameras):
+def test_a_point_cloud_of_another_object_does_not_match_the_silhouettes(seen_cameras):
     cameras, intrinsics, pixels = seen_cameras
     points = box_points()
     for others in (points + 0.5 * SCALE, (points - ORIGIN) * 2 + ORIGIN, (points - ORIGIN) / 2 + ORIGIN):
@@ -137,7 +137,7 @@ WRONG = tuple(wrong_cameras(torch.eye(4, dtype=torch.float64)))
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_a_wrong_camera_is_told_by_the_cloud_and_by_the_others(seen_cameras, kind):
+def test_a_wrong_camera_is_detected_by_the_cloud_and_by_the_other_cameras(seen_cameras, kind):
     cameras, intrinsics, pixels = seen_cameras
     for index in (0, 7, 23):
         damaged = cameras.clone()
@@ -147,7 +147,7 @@ def test_a_wrong_camera_is_told_by_the_cloud_and_by_the_others(seen_cameras, kin
         assert agreeing_views(damaged, intrinsics, pixels).tolist() == expected
 
 
-def test_several_wrong_cameras_are_told_among_few(seen_cameras):
+def test_several_wrong_cameras_among_few_are_detected(seen_cameras):
     cameras, intrinsics, pixels = (each[::3] for each in seen_cameras)
     damaged = cameras.clone()
     for index, kind in ((1, "turned"), (4, "elsewhere"), (6, "turned a little")):
@@ -157,7 +157,7 @@ def test_several_wrong_cameras_are_told_among_few(seen_cameras):
     assert agreeing_views(damaged, intrinsics, pixels).tolist() == expected
 
 
-def test_a_camera_that_is_turned_on_its_side_does_not_move_up(seen_cameras):
+def test_a_camera_turned_on_its_side_does_not_change_the_up_direction(seen_cameras):
     cameras = seen_cameras[0].clone()
     for degrees in (45, 90):
         roll = so3_exp(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
@@ -165,7 +165,7 @@ def test_a_camera_that_is_turned_on_its_side_does_not_move_up(seen_cameras):
         assert math.degrees(torch.acos(frame_of_points(cameras, box_points()).axes[1] @ WORLD[:, 1])) < 1.5
 
 
-def test_cameras_on_a_vertical_arc_do_not_tell_up(tmp_path):
+def test_cameras_on_a_vertical_arc_leave_the_up_direction_undetermined(tmp_path):
     latitudes = torch.linspace(-0.5, 0.5, 6, dtype=torch.float64)
     cameras = camera_to_world(torch.stack([latitudes, torch.ones(6).double(), 3 * torch.ones(6).double()], dim=-1))
     outline = np.array([[90.0, 90.0], [110.0, 110.0], [90.0, 110.0]])
@@ -216,7 +216,7 @@ def test_views_keep_the_true_relative_poses_but_for_up_and_scale(root, tmp_path,
     assert record["viewpoint_quality_score"] == 2.5 and record["point_cloud_quality_score"] == 1.7
 
 
-def test_masks_of_zeros_and_ones_mark_the_same_pixels(make, root):
+def test_masks_of_zeros_and_ones_select_the_same_pixels(make, root):
     name = f"hydrant-{SEQUENCE}"
     pixels = [mask_pixels(each) for each in make().photographs(name).photographs]
     for file in (root / "hydrant" / SEQUENCE / "masks").glob("*.png"):
@@ -288,7 +288,7 @@ def test_scenes_are_drawn_once_and_kept(tmp_path):
         CO3DData(str(root), views=str(tmp_path / "others")).names()
 
 
-def test_truncated_frames_are_left_out_and_the_download_is_left_alone(make, root, tmp_path):
+def test_truncated_frames_are_skipped_and_the_download_is_unchanged(make, root, tmp_path):
     mask = root / "hydrant" / SEQUENCE / "masks" / "frame000003.png"
     Image.fromarray(np.pad(np.full((100, 100), 255, np.uint8), ((140, 0), (0, 100)))).save(mask)
     Image.new("L", SIZE).save(mask.with_name("frame000004.png"))

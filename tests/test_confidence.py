@@ -1,4 +1,4 @@
-"""What people are told of an answer: its words, its probability, a second answer, and whether to trust it."""
+"""The description of an answer: words, probability, second answer and verdict."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_the_second_answer_is_the_most_probable_end_elsewhere():
     assert (half.words, half.verdict, near.verdict) == ("30° to the right", "doubtful", "trust")
 
 
-def test_nothing_is_told_without_a_probability_or_a_pose():
+def test_no_verdict_without_a_probability_or_a_pose():
     assert answers(None) == []
     silent = solution([(0, 30, 0.6)])
     assert answers(Solution(silent.poses, silent.energies, silent.valid, silent.chosen, silent.cost)) == []
@@ -91,7 +91,7 @@ def test_nothing_is_told_without_a_probability_or_a_pose():
 
 
 @pytest.mark.parametrize(("recoloured", "verdict"), [(False, "trust"), (True, "do not trust")])
-def test_a_prior_tells_objects_that_it_knows_from_others(recoloured, verdict):
+def test_a_prior_distinguishes_familiar_from_unfamiliar_objects(recoloured, verdict):
     views = [toy_view("duck", *place) for place in ((6, 17), (-11, 69))]
     if recoloured:
         pixels = [np.asarray(view) for view in views]

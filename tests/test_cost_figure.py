@@ -1,4 +1,4 @@
-"""The figure of accuracy against seconds: who is in it, and where."""
+"""The figure of accuracy over time: its solvers and their positions."""
 
 import pytest
 from result_folders import metrics, write_result
@@ -13,7 +13,7 @@ def table_of(folder):
     return tables[0]
 
 
-def test_a_mark_a_solver_at_its_seconds_and_recall(tmp_path):
+def test_each_solver_is_marked_at_its_seconds_and_recall(tmp_path):
     for number, (solver, recall, seconds) in enumerate(
         [("ifusion", 0.6, 20.0), ("two_stage", 0.9, 5.0), ("features", 0.1, 0.02)]
     ):

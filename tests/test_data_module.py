@@ -267,7 +267,7 @@ def test_test_views_can_be_cropped_as_photographs_are_and_others_are_not(make, r
             assert shown[0].mean() == pytest.approx(127.5 if cropped else 180, abs=2)
 
 
-def test_what_was_moved_to_compute_features_can_still_be_trained(make):
+def test_a_backbone_moved_to_compute_features_can_still_be_trained(make):
     backbone, data = Moving(), make()
     data.cache_features(backbone)
     data.prepare_data()
@@ -318,7 +318,7 @@ class Squares(Means):
         return super().trunk(images**2)
 
 
-def test_features_of_earlier_code_are_not_taken(make):
+def test_features_of_earlier_code_are_not_reused(make):
     for extractor in (Means(), Squares()):
         data = make()
         data.cache_features(extractor)
@@ -490,7 +490,7 @@ def test_the_render_command_sees_another_mesh_under_the_name(mesh_data, meshes):
         mesh_data().prepare(check_meshes=True)
 
 
-def test_another_protocol_is_seen_in_any_case(mesh_data):
+def test_a_changed_protocol_is_always_detected(mesh_data):
     mesh_data().prepare()
     with pytest.raises(UserError, match=r"rendered differently \(test_views was 2, is 3\)"):
         mesh_data(test_views=3).prepare()
@@ -508,7 +508,7 @@ def test_a_broken_mesh_is_named_and_the_others_are_rendered(mesh_data, meshes, t
     assert renderer.drawn == 0
 
 
-def test_what_else_lies_among_the_views_is_not_part_of_the_data_set(mesh_data, meshes, tmp_path):
+def test_other_files_among_the_views_are_ignored(mesh_data, meshes, tmp_path):
     write_object(tmp_path / "rendered", "cup", train=12)
     mesh_data().prepare()
     (meshes / "brick.ply").unlink()
@@ -521,7 +521,7 @@ def labels_of(source: ViewSource, split: str = "test") -> dict[str, tuple[str, b
     return {each.name: (each.ambiguity, each.unique_answer) for each in views}
 
 
-def test_labels_of_a_file_hold_for_views_that_are_there_already_and_change_nothing_on_disk(mesh_data, tmp_path):
+def test_labels_apply_to_existing_views_without_changing_files(mesh_data, tmp_path):
     mesh_data().prepare()
     before = {path: path.read_bytes() for path in (tmp_path / "rendered").rglob("*.*") if path.is_file()}
     file = tmp_path / "labels.yaml"
@@ -552,7 +552,7 @@ def test_one_file_of_labels_serves_seen_and_unseen_objects(mesh_data, tmp_path):
     assert {obj.name: obj.ambiguity for half in halves for obj in half} == {"brick": "twofold", "cube": "continuous"}
 
 
-def test_files_that_are_no_meshes_are_passed_over(mesh_data, meshes):
+def test_files_that_are_not_meshes_are_ignored(mesh_data, meshes):
     (meshes / "readme.txt").write_text("two boxes")
     (meshes / "._cube.ply").write_text("what some systems leave behind")
     (meshes / "cube.PLY.bak").write_text("")
@@ -598,6 +598,6 @@ def test_the_data_sets_are_known_by_name():
     assert registry.get("data", "renderings") is RenderingsData
 
 
-def test_a_folder_of_views_that_is_not_there(tmp_path):
+def test_a_missing_folder_of_views(tmp_path):
     with pytest.raises(UserError, match=r"nowhere: there is no such folder of views"):
         PairDataModule(RenderingsData(str(tmp_path / "nowhere")), cache=str(tmp_path)).prepare_data()

@@ -1,4 +1,4 @@
-"""DDIM against what is known in closed form: data that is one image, and data that is Gaussian."""
+"""DDIM against closed forms: data of a single image, and Gaussian data."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def test_the_same_generator_gives_the_same_latents():
     assert torch.equal(once, again)
 
 
-def test_guidance_goes_on_from_the_unconditional_through_the_conditional():
+def test_guidance_extrapolates_from_unconditional_to_conditional():
     free, conditional = torch.tensor([1.0, 2.0]), torch.tensor([2.0, 0.0])
     assert torch.equal(guided(free, conditional, 0.0), free)
     assert torch.equal(guided(free, conditional, 1.0), conditional)
     assert torch.equal(guided(free, conditional, 3.0), torch.tensor([4.0, -4.0]))
 
 
-def test_settings_that_make_no_sense():
+def test_invalid_settings():
     for steps in (0, -1, 1001):
         with pytest.raises(UserError, match=f"steps must lie between 1 and 1000, got {steps}"):
             ddim_timesteps(steps)

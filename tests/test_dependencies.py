@@ -78,8 +78,8 @@ def test_a_package_has_the_licence_that_is_listed(name):
     assert any(word in text for text in known for word in WORDS[listed()[name][1]])
 
 
-def test_what_is_imported_is_named():
-    """Of other packages only those of pyproject.toml, so that nothing is there by the grace of another package."""
+def test_all_imported_packages_are_dependencies():
+    """Only packages in pyproject.toml are imported, none that are merely dependencies of others."""
     imported = set()
     for file in (ROOT / "lp_framework").rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):

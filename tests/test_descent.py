@@ -1,4 +1,4 @@
-"""Batched descent against PyTorch's optimizers, a start at a time; and what stops a start."""
+"""Batched descent against PyTorch's optimizers, one start at a time; and failing starts."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class Fails:
 
 @pytest.mark.parametrize("what", ["nan", "inf", "gradient"])
 @pytest.mark.parametrize("since", [0, 4])
-def test_a_start_that_fails_stops_where_it_was_sound_and_leaves_the_others_alone(what, since):
+def test_a_failing_start_stops_at_its_last_valid_pose_without_affecting_others(what, since):
     begin = parameters()
 
     def run(landscape):
@@ -140,7 +140,7 @@ def test_a_pose_that_is_not_finite_after_the_last_step_is_not_kept():
     assert found.trajectory[0, :, -1, 0].tolist() == [0.375, 1.5]
 
 
-def test_longitudes_go_on_over_the_turn():
+def test_longitudes_are_continuous_beyond_a_full_turn():
     true = torch.tensor([6.0, 6.2, 6.5, 6.1, 3.3, 0.3, -2.7])
     path = torch.stack([torch.zeros(7), true % (2 * torch.pi), torch.ones(7)], dim=-1)[None, None]
     found = unwrapped(path)

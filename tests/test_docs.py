@@ -1,4 +1,4 @@
-"""The documentation: it builds strictly and without network, and names everything that is public or can be chosen."""
+"""The documentation builds strictly without network, and covers everything that is public or can be chosen."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def found(name: str) -> object:
 
 
 @pytest.mark.heavy
-def test_the_notebook_runs_and_finds_the_poses_that_it_tells_of():
+def test_the_notebook_runs_and_finds_the_poses_it_states():
     notebook = nbformat.read(DOCS / "notebook.ipynb", as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell for cell in code if cell.outputs or cell.execution_count] == []  # outputs are not committed

@@ -1,4 +1,4 @@
-"""The worked examples of docs/examples, which are plugins: they do what their pages say."""
+"""The examples in docs/examples, which are plugins, work as their pages say."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ registry.discover([EXAMPLES])
 # ---------------------------------------------------------------- the solver
 
 
-def test_pattern_search_finds_the_minimum_of_the_valley_in_which_it_begins():
+def test_pattern_search_finds_the_minimum_of_its_basin():
     pairs, true = exact_pairs(4)
     solver = registry.build("solver", {"name": "pattern_search", "steps": 60}, prior=ExactPrior([0.0, math.pi]))
     solution = solver.solve(pairs, around(true, 0.4, 2.8), seed=0)
@@ -77,7 +77,7 @@ def energies(prior: Prior, images: Tensor, longitudes: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("true_degrees", [-60, -25, 0, 40, 75])
-def test_the_cylinder_has_its_least_energy_at_the_true_longitude(true_degrees):
+def test_the_cylinder_has_its_lowest_energy_at_the_true_longitude(true_degrees):
     longitudes = torch.arange(-180, 180, 5).deg2rad()
     images = cans(0.7, 0.7 + math.radians(true_degrees))
     best = longitudes[energies(cylinder(), images, longitudes).argmin()].rad2deg()

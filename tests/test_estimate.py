@@ -1,4 +1,4 @@
-"""`estimate` and `estimate_pose`: pictures in, the solver's poses out, in every file and in the right order."""
+"""`estimate` and `estimate_pose`: the solver's poses are in every output file, in the right order."""
 
 from __future__ import annotations
 
@@ -104,9 +104,7 @@ def estimate(lp: Callable[..., Finished], *overrides: str) -> Finished:
 # ---------------------------------------------------------------- the command
 
 
-def test_a_field_of_view_that_the_solver_was_told_is_that_of_the_exports_and_pictures(
-    lp, write, tmp_path: Path, monkeypatch
-):
+def test_the_solvers_field_of_view_setting_is_used_in_exports_and_pictures(lp, write, tmp_path: Path, monkeypatch):
     solver = SOLVER.replace("    def __init__", "    field_of_view_degrees = 30.0\n\n        def __init__")
     write("plugins/tmp_brightness/tmp_brightness.py", solver)
     for name in ("a", "b"):
@@ -124,7 +122,7 @@ def test_a_field_of_view_that_the_solver_was_told_is_that_of_the_exports_and_pic
     assert drawn_with and drawn_with == pytest.approx([math.radians(30)] * len(drawn_with))
 
 
-def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
+def test_all_files_agree(lp, photos: Path, tmp_path: Path):
     finished = estimate(lp, "images=photos", "latitude_degrees=10", "radius=1.5")
     assert finished.status == 0, finished.err
     run = tmp_path / "run"
@@ -177,7 +175,7 @@ def test_every_file_says_the_same(lp, photos: Path, tmp_path: Path):
 
 
 def test_cameras_open_elsewhere_with_the_crops_and_with_the_photographs(lp, photos: Path, tmp_path: Path):
-    """One is a JPEG that a telephone has turned, with its focal length; the others have none."""
+    """One is a JPEG with an EXIF orientation and focal length; the others have neither."""
     exif = Image.Exif()
     exif[274] = 6  # turn it clockwise
     exif.get_ifd(0x8769)[41989] = 28  # mm on 35 mm film
@@ -291,7 +289,7 @@ def test_a_camera_behind_the_object_is_no_pose(lp, photos: Path, tmp_path: Path)
         (["images=photos", "accelerator=tpu"], "accelerator=tpu is not available on this machine"),
     ],
 )
-def test_mistakes_are_met_before_any_model_is_loaded(lp, photos, overrides, error, tmp_path, monkeypatch):
+def test_mistakes_are_found_before_any_model_is_loaded(lp, photos, overrides, error, tmp_path, monkeypatch):
     if "broken" in str(overrides):
         (photos / "broken.png").write_bytes((photos / "front.png").read_bytes()[:400])
     monkeypatch.setattr(Components, "__getitem__", lambda components, group: pytest.fail("too early"))
@@ -381,7 +379,7 @@ def test_mistakes_name_the_picture():
         lp_framework.estimate_pose(image, image, solver=recorder, starts="grit")
 
 
-def test_it_works_out_of_the_box_on_objects_never_met(recwarn):
+def test_it_works_out_of_the_box_on_unseen_objects(recwarn):
     views = [toy_view("soup_can", *place) for place in ((10, 20), (20, 80))]
     solution = lp_framework.estimate_pose(*views)
     latitude, longitude, radius = solution.answer()[0].tolist()
@@ -394,7 +392,7 @@ def test_it_works_out_of_the_box_on_objects_never_met(recwarn):
     assert whole.answer()[0, 2] != 0
 
 
-def test_names_mean_what_they_do_elsewhere_and_other_models_have_no_probability():
+def test_registered_names_work_and_other_models_have_no_probability():
     reference, query = placed(drawn(80, 60), 30, 20), placed(drawn(60, 80), 30, 20)
     with pytest.warns(UserWarning, match="supports only the twelve embedded objects"):
         solution = lp_framework.estimate_pose(reference, query, solver="two_stage", starts="grid", model="score")
@@ -587,7 +585,7 @@ def test_grey_and_dark_pictures_have_finite_answers(general: PoseModel, change, 
     assert answer.probability < 0.5 if not known else longitude == pytest.approx(60, abs=15)
 
 
-def test_half_a_mask_is_taken_for_what_it_is(general: PoseModel):
+def test_a_mask_of_half_the_object_is_used_as_given(general: PoseModel):
     views = [toy_view("soup_can", *place) for place in ((10, 20), (20, 80))]
     pixels = np.array(views[0])
     pixels[:, 128:, 3] = 0

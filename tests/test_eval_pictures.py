@@ -26,5 +26,5 @@ def test_without_pictures_there_are_the_same_tables_and_nothing_else(commands):
     assert (bare.folder / "pairs.csv").read_bytes() == (drawn.folder / "pairs.csv").read_bytes()
 
 
-def test_pictures_are_wanted_or_not(commands):
+def test_pictures_must_be_true_or_false(commands):
     assert commands.here("x", "eval", *SHORT, "pictures=some").error == "pictures must be true or false, got some"

@@ -130,7 +130,7 @@ def test_the_table_has_the_papers_layout_and_the_last_lines_name_the_files(evalu
     assert names == ["all objects", "unique answer", "unique", "twofold", "continuous", *OBJECTS]
 
 
-def test_a_run_again_gives_the_same_numbers(evaluated, commands):
+def test_results_are_reproducible(evaluated, commands):
     again = commands.here("again", "eval", "checkpoint=./score/checkpoints/best.ckpt")
     assert comparable(again) == comparable(evaluated)
     assert (again.folder / "pairs.csv").read_bytes() == (evaluated.folder / "pairs.csv").read_bytes()
@@ -280,7 +280,7 @@ def recipe(commands: Commands, group: str, **changes: Any) -> dict[str, Any]:
     return {**contents, group: {**contents[group], **changes}}
 
 
-def test_what_a_solver_does_not_take_is_said_and_its_model_is_named(commands):
+def test_unused_settings_are_reported_and_the_model_is_named(commands):
     quick = ("solver.iterations=1", "checkpoint=./score")
     ran = commands.here("unused", "eval", *quick, "prior.path=nowhere")
     assert ran.status == 0 and "WARNING: prior=... has no effect: solver=langevin takes no prior" in ran.err
@@ -319,7 +319,7 @@ def test_odd_settings_of_the_trainer(commands, setting, sentence):
     assert commands.here("odd", "eval", f"++trainer.{setting}", "checkpoint=./score").error.startswith(sentence)
 
 
-def test_a_checkpoint_that_is_not_there(commands):
+def test_a_missing_checkpoint(commands):
     assert commands.here("x", "eval", "checkpoint=gone.ckpt").error == "gone.ckpt: there is no such checkpoint"
     assert commands.here("x", "eval", "checkpoint=views").error.startswith("views: contains no checkpoints/best.ckpt")
 
@@ -340,7 +340,7 @@ def test_a_file_that_is_no_readable_checkpoint(commands, kind):
     assert not (commands.folder / "executed").exists()
 
 
-def test_the_checkpoint_of_something_else(commands):
+def test_checkpoints_of_other_programs(commands):
     stored(commands, "foreign.ckpt", lp_framework=None)
     wanted = "foreign.ckpt: is not a checkpoint written by `lp train`"
     assert commands.here("x", "eval", "checkpoint=foreign.ckpt").error == wanted
@@ -368,7 +368,7 @@ def test_a_checkpoint_of_an_unknown_backbone_or_setting(commands):
     assert "widht" in error
 
 
-def test_a_frozen_trunk_other_than_that_of_training_is_noticed(commands):
+def test_a_frozen_trunk_with_other_weights_is_detected(commands):
     stored(commands, "drawn.ckpt", lp_framework=recipe(commands, "backbone", draw=1))
     assert commands.here("x", "eval", "checkpoint=drawn.ckpt").error == (
         "drawn.ckpt: the frozen part of its backbone has other weights here than when the model was trained; "

@@ -33,7 +33,7 @@ def along_longitude(prior, count=720):
 
 
 @pytest.mark.parametrize("minima", [1, 2, 3, 4])
-def test_it_has_as_many_minima_as_asked(minima):
+def test_it_has_the_requested_minima(minima):
     offsets = [2 * math.pi * k / minima for k in range(minima)]
     longitude, energy = along_longitude(ExactPrior(offsets))
     lowest = (energy < energy.roll(1)) & (energy < energy.roll(-1))
@@ -41,7 +41,7 @@ def test_it_has_as_many_minima_as_asked(minima):
     torch.testing.assert_close(energy[lowest], torch.zeros(minima, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-def test_a_second_valley_may_be_shallower():
+def test_the_second_minimum_may_be_shallower():
     longitude, energy = along_longitude(ExactPrior([0.0, math.pi], depths=[0.0, 0.3]))
     lowest = (energy < energy.roll(1)) & (energy < energy.roll(-1))
     assert lowest.sum() == 2 and longitude[energy.argmin()] == 0

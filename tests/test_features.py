@@ -1,4 +1,4 @@
-"""`solver=features`: known two-view geometry, rendered objects, and too little to go by."""
+"""`solver=features`: known two-view geometry, rendered objects, and images without enough matches."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_another_field_of_view(degrees):
     assert degrees == FIELD_OF_VIEW or rotation[FIELD_OF_VIEW] > 0.1
 
 
-def test_noise_and_outliers_are_survived():
+def test_robustness_to_noise_and_outliers():
     images = image_of(VIEWS).float()
     images = torch.nn.functional.pad(images, (0, SIZE - 8, 0, SIZE - 8))
     matcher = KnownMatcher(noise=0.3, outliers=60, size=SIZE)
@@ -412,7 +412,7 @@ def test_solvers_and_models_can_be_imported_without_optional_packages():
     assert ran.returncode == 0, ran.stderr
 
 
-def test_weights_of_a_matcher_that_cannot_be_had(tmp_path):
+def test_unavailable_weights_of_a_matcher(tmp_path):
     pytest.importorskip("transformers")
     with pytest.raises(UserError, match=f"{tmp_path}: the weights of efficientloftr cannot be loaded from there"):
         Features(matcher="efficientloftr", weights=str(tmp_path))

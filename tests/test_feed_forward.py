@@ -1,4 +1,4 @@
-"""`solver=dust3r` and `solver=vggt`: all of their geometry, with stand-ins for the authors' packages."""
+"""`solver=dust3r` and `solver=vggt`: all of their geometry, with mocks of the authors' packages."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_without_the_package_of_vggt():
         registry.build("solver", "vggt")
 
 
-def test_a_package_that_lacks_one_of_its_own(monkeypatch):
+def test_a_package_with_a_missing_dependency(monkeypatch):
     with packages():
         monkeypatch.setitem(sys.modules, "dust3r.cloud_opt", None)
         with pytest.raises(UserError, match=r"solver=dust3r needs the Python package 'dust3r.cloud_opt'"):
@@ -129,7 +129,7 @@ def test_a_package_that_lacks_one_of_its_own(monkeypatch):
 
 
 @BOTH
-def test_weights_that_are_not_there(name, tmp_path):
+def test_missing_weights(name, tmp_path):
     with pytest.raises(UserError, match=r"gone.pth: there is no such file with the weights of"):
         build(name, weights="gone.pth")
     with pytest.raises(

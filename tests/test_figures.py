@@ -83,7 +83,7 @@ def test_a_priors_field_is_minus_the_gradient_of_its_landscape():
     torch.testing.assert_close(pose_energies(prior, PAIRS, same, draws).view_as(energies), energies)
 
 
-def test_a_density_is_one_where_the_energy_is_least():
+def test_a_density_is_one_at_the_lowest_energy():
     latitude, longitude = landscape_grid()
     energy = 2 - longitude.cos() + latitude.square()[:, None]
     values = Landscape(latitude, longitude, 0.0, energy).density().energy
@@ -91,7 +91,7 @@ def test_a_density_is_one_where_the_energy_is_least():
     torch.testing.assert_close(values.log(), energy.min() - energy)
 
 
-def test_the_exact_field_has_no_error_and_one_half_as_long_is_half_off():
+def test_the_exact_field_has_error_zero_and_half_of_it_has_error_one_half():
     class Half(ExactModel):
         def field(self, condition, pose):
             field = super().field(condition, pose)
@@ -107,7 +107,7 @@ def test_the_exact_field_has_no_error_and_one_half_as_long_is_half_off():
     np.testing.assert_allclose(grid.score[..., 2], 0, atol=1e-6)  # at the true radius
 
 
-def test_pairs_are_the_views_that_were_asked_for(data):
+def test_pairs_are_the_requested_views(data):
     pairs, shown = named_pairs(data, ["tram", "cup"], [(2, 0), (1, 3)], CPU)
     table = data.table("test")
     for number, (name, places) in enumerate((("tram", (2, 0)), ("cup", (1, 3)))):
@@ -134,7 +134,7 @@ def test_pairs_are_the_views_that_were_asked_for(data):
             named_pairs(data, *wrong, CPU)
 
 
-def test_landscapes_say_how_many_minima_they_have(data):
+def test_landscapes_state_the_number_of_minima(data):
     def gathered(prior):
         return LandscapesFigure(["cup"], data=data, prior=prior, timesteps=[500]).analyse(0, CPU)[0].prior_energy
 
@@ -144,7 +144,7 @@ def test_landscapes_say_how_many_minima_they_have(data):
     assert minima_in_words(gathered(ExactPrior(stiffness=0.0))) == "plateau"  # nothing to tell anywhere
 
 
-def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
+def test_trajectories_start_at_four_longitudes_and_show_views_along_them(data):
     settings = {"data": data, "prior": ExactPrior(), "reference": 1, "query": 2, "timesteps": [500]}
     figure = TrajectoriesFigure("cup", steps=40, views=3, **settings)
     pair, images = figure.analyse(0, CPU)
@@ -161,7 +161,7 @@ def test_trajectories_go_from_four_longitudes_and_show_views_on_the_way(data):
 
 
 def test_generated_views_differ_by_their_poses_alone():
-    """Whatever comes along with them."""
+    """Independent of the rest of the batch."""
     prior = load_prior("tiny")
     source = prior.encode(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)) * 2 - 1)
     poses = torch.tensor([[0.0, 0.5, 0.0], [0.2, 3.0, 0.0], [0.0, 0.5, 0.0]])
@@ -361,5 +361,5 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
         (["figure=failures", "figure.views=1"], "figure.views must be 2 to 12"),
     ],
 )
-def test_a_mistake_is_told_in_one_sentence(commands, settings, message):
+def test_a_mistake_is_one_sentence(commands, settings, message):
     assert message in commands.here("runs/mistake", "figure", "prior=tmp_valleys", *settings).error

@@ -1,4 +1,4 @@
-"""Damaged weights, of any origin, give the tensors that were saved or one sentence; what hides in them is never run."""
+"""Damaged weights, of any origin, give the saved tensors or one sentence; code in them is never executed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from corruptions import NONSENSE, damaged, json_damage, misshapen, read_or_told, snapshot
+from corruptions import NONSENSE, damaged, json_damage, misshapen, read_or_reported, snapshot
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
@@ -105,7 +105,7 @@ def same_or_other_bits(tensors: dict[str, Tensor]) -> None:
 def test_checkpoints_of_training(here, content):
     file = here / "last.ckpt"
     file.write_bytes(content)
-    read_or_told(lambda: load_model(file), file)
+    read_or_reported(lambda: load_model(file), file)
     assert file.read_bytes() == content and [each.name for each in here.iterdir()] == ["last.ckpt"]
 
 
@@ -114,7 +114,7 @@ def test_checkpoints_of_training(here, content):
 def test_checkpoints_read_without_unpickling(here, content):
     file = here / "original.ckpt"
     file.write_bytes(content)
-    tensors = read_or_told(lambda: {name: stored.map() for name, stored in read_state_dict(file).items()}, file)
+    tensors = read_or_reported(lambda: {name: stored.map() for name, stored in read_state_dict(file).items()}, file)
     assert file.read_bytes() == content and [each.name for each in here.iterdir()] == ["original.ckpt"]
     if tensors is not None:
         same_or_other_bits(tensors)
@@ -137,7 +137,7 @@ def safetensors(draw: st.DrawFn) -> bytes:
 def test_safetensors(here, content):
     file = here / "model.safetensors"
     file.write_bytes(content)
-    tensors = read_or_told(lambda: {name: stored.map() for name, stored in read_safetensors(file).items()}, file)
+    tensors = read_or_reported(lambda: {name: stored.map() for name, stored in read_safetensors(file).items()}, file)
     assert file.read_bytes() == content
     if tensors is not None:
         same_or_other_bits(tensors)
@@ -163,7 +163,7 @@ def test_folders_of_models(shipped, data):
         before = snapshot(folder)
         prior = folder.name == "tiny"
         load = (lambda: lp_framework.load_prior("tiny", path=str(folder))) if prior else (lambda: load_model(folder))
-        read_or_told(load, folder)
+        read_or_reported(load, folder)
         assert snapshot(folder) == before
     finally:
         file.write_bytes(whole)
@@ -173,7 +173,7 @@ def test_a_folder_of_a_model_with_nonsense_as_weights(here):
     (here / "model.json").write_text(json.dumps({**RECIPE, "trunk": None}))
     for content in (b"", b"{}", pickle.dumps(Runs()), saved(Runs())):
         (here / "model.safetensors").write_bytes(content)
-        read_or_told(lambda: read_checkpoint(here / "model.safetensors"), "model.safetensors")
+        read_or_reported(lambda: read_checkpoint(here / "model.safetensors"), "model.safetensors")
         assert not (here / "executed").exists()
 
 
@@ -194,15 +194,15 @@ def test_a_folder_of_a_model_with_nonsense_as_weights(here):
         read_state_dict,
     ],
 )
-def test_no_way_of_loading_runs_what_a_file_brings(here, load, write, container):
+def test_no_loader_executes_code_from_a_file(here, load, write, container):
     pytest.importorskip("diffusers", reason="prior=zero123 is in the extra zero123")
     file = here / "evil.ckpt"
     file.write_bytes(write(container(Runs())))
-    assert read_or_told(lambda: load(file), file) is None
+    assert read_or_reported(lambda: load(file), file) is None
     assert not (here / "executed").exists()
 
 
-def test_a_run_that_is_resumed_does_not_run_what_its_checkpoint_brings(tmp_path):
+def test_resuming_a_run_executes_no_code_from_its_checkpoint(tmp_path):
     commands = Commands(tmp_path, train_views=6, test_views=2)
     assert commands.here("run", "train", "trainer.max_epochs=1").status == 0
     (last, best) = (commands.folder / "run" / "checkpoints" / name for name in ("last.ckpt", "best.ckpt"))
@@ -217,13 +217,13 @@ def test_a_run_that_is_resumed_does_not_run_what_its_checkpoint_brings(tmp_path)
 
 
 @pytest.mark.parametrize("value", [None, [], {"backbone": 3}, {"model": 3, "backbone": {"name": "small"}}])
-def test_a_recipe_that_is_none(here, value):
+def test_invalid_recipes(here, value):
     torch.save({"lp_framework": value, "state_dict": TENSORS}, here / "last.ckpt")
-    assert read_or_told(lambda: load_model(here / "last.ckpt"), "last.ckpt") is None
+    assert read_or_reported(lambda: load_model(here / "last.ckpt"), "last.ckpt") is None
 
 
 @FUZZ
 @given(recipe=misshapen(RECIPE) | NONSENSE)
 def test_recipes(here, recipe):
     (here / "last.ckpt").write_bytes(saved({"lp_framework": recipe, "state_dict": {}}))
-    assert read_or_told(lambda: load_model(here / "last.ckpt"), "last.ckpt") is None
+    assert read_or_reported(lambda: load_model(here / "last.ckpt"), "last.ckpt") is None

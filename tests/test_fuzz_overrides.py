@@ -1,4 +1,4 @@
-"""Whatever stands on the command line, it composes to a configuration or is told in one sentence."""
+"""Any command line composes to a configuration or gives an error of one sentence."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ OVERRIDE = st.one_of(
 @pytest.mark.usefixtures("lp")
 @FUZZ
 @given(command=st.sampled_from(["eval", "train", "estimate"]), overrides=st.lists(OVERRIDE, min_size=1, max_size=3))
-def test_a_command_line_composes_or_is_told_in_one_sentence(command, overrides):
+def test_a_command_line_composes_or_gives_one_sentence(command, overrides):
     argv, sys.argv = sys.argv, ["lp", command, *overrides, "--cfg", "job"]
     out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
     err = io.StringIO()

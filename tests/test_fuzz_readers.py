@@ -1,5 +1,4 @@
-"""Whatever is in a file, its reader gives a right result or one sentence that names it, and leaves all files as they
-are."""
+"""For any file content, readers return a valid result or one sentence naming the file, and change no files."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from corruptions import NONSENSE, damaged, json_damage, misshapen, read_or_told, snapshot
+from corruptions import NONSENSE, damaged, json_damage, misshapen, read_or_reported, snapshot
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -71,7 +70,7 @@ def test_transform_json(views, content):
     file = views / "cup" / "test" / "transform.json"
     file.write_bytes(content)
     before = snapshot(views)
-    found = read_or_told(lambda: read_views(views, "cup", "test"), file)
+    found = read_or_reported(lambda: read_views(views, "cup", "test"), file)
     assert snapshot(views) == before
     if found is not None:
         assert len(found) == len(found.files) == len(found.cameras) > 0
@@ -84,7 +83,7 @@ def test_transform_json(views, content):
 @given(content=json_damage({"chosen": {"seed": 0}, "seen": ["a", "b"], "unseen": ["c"]}))
 def test_objects_json(tmp_path, content):
     (tmp_path / "objects.json").write_bytes(content)
-    lists = read_or_told(lambda: kept_lists(tmp_path, {"seed": 0}, lambda: ObjectLists([], [])), "objects.json")
+    lists = read_or_reported(lambda: kept_lists(tmp_path, {"seed": 0}, lambda: ObjectLists([], [])), "objects.json")
     assert (tmp_path / "objects.json").read_bytes() == content
     if lists is not None:
         assert all(isinstance(name, str) for name in [*lists.seen, *lists.unseen])
@@ -128,7 +127,7 @@ def test_poses_of_omni3d(tmp_path_factory, content):
     file = root / "dinosaur_002" / "poses" / "011.npy"
     file.write_bytes(content)
     before = snapshot(root)
-    cameras = read_or_told(lambda: omni3d_cameras(root, "dinosaur_002"), file)
+    cameras = read_or_reported(lambda: omni3d_cameras(root, "dinosaur_002"), file)
     assert snapshot(root) == before
     if cameras is not None:
         stacked = torch.stack(list(cameras.values()))
@@ -150,7 +149,7 @@ def test_annotations_of_hopev2(hope, tmp_path_factory, data):
     try:
         file.write_bytes(data.draw(json_damage(json.loads(whole)), "content"))
         before = snapshot(hope)
-        read_or_told(
+        read_or_reported(
             lambda: photographs_of(HOPEv2Data(str(hope), splits=["val"])), file, file.parent, "mask_visib", "rgb"
         )
         assert snapshot(hope) == before
@@ -189,7 +188,7 @@ def test_annotations_of_co3d(co3d, tmp_path_factory, data):
             set_list.write_bytes(data.draw(json_damage(json.loads(listed)), "content"))
         before = snapshot(co3d)
         dataset = CO3DData(str(co3d), str(tmp_path_factory.mktemp("views")), scenes=1)
-        read_or_told(lambda: photographs_of(dataset), file, set_list, SEQUENCE, co3d)
+        read_or_reported(lambda: photographs_of(dataset), file, set_list, SEQUENCE, co3d)
         assert snapshot(co3d) == before
     finally:
         file.write_bytes(whole)
@@ -214,7 +213,7 @@ def test_meshes(tmp_path_factory, data):
     file.write_bytes(data.draw(damaged(MESHES[suffix]), "content"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scene = read_or_told(lambda: load_scene(file), file)
+        scene = read_or_reported(lambda: load_scene(file), file)
     if scene is not None:
         assert scene.extents.max() == pytest.approx(1)
 
@@ -246,7 +245,7 @@ def test_results_json(tmp_path_factory, result, data):
 
 @FUZZ
 @given(content=damaged(b"hydra:\n  job: {name: eval}\n  runtime:\n    choices: {experiment: gamma}\n"))
-def test_what_hydra_keeps_of_a_job(tmp_path_factory, content):
+def test_hydras_record_of_a_job(tmp_path_factory, content):
     folder = write_result(tmp_path_factory.mktemp("runs") / "one")
     (folder / ".hydra" / "hydra.yaml").write_bytes(content)
     runs, left_out = find_runs([folder])
@@ -279,14 +278,14 @@ def journal(tmp_path_factory) -> tuple[Path, dict, SolvedBatch]:
 @FUZZ
 @given(data=st.data())
 def test_the_journal_of_an_evaluation(journal, data):
-    """What is damaged is as if it were not there, and its pairs are solved again."""
+    """Damaged lines are ignored, and their pairs are solved again."""
     folder, subject, batch = journal
     before = snapshot(folder)
     file = folder / "unfinished" / data.draw(st.sampled_from(["evaluation.json", "rank_0.jsonl"]), "file")
     damage = json_damage(SUBJECT) if file.suffix == ".json" else damaged(file.read_bytes())
     try:
         file.write_bytes(data.draw(damage, "content"))
-        for found in read_or_told(lambda: Journal(folder, subject).begin("a"), folder) or []:
+        for found in read_or_reported(lambda: Journal(folder, subject).begin("a"), folder) or []:
             assert torch.equal(found.pair, batch.pair) and torch.equal(found.rotation, batch.rotation)
     finally:
         file.parent.mkdir(exist_ok=True)
@@ -301,7 +300,7 @@ def test_labels_of_objects(tmp_path, content):
     file.write_bytes(content)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        labels = read_or_told(lambda: read_labels(file, ["cup", "mug"], tmp_path), file)
+        labels = read_or_reported(lambda: read_labels(file, ["cup", "mug"], tmp_path), file)
     assert file.read_bytes() == content
     if labels is not None:
         assert set(labels) <= {"cup", "mug"}
@@ -328,7 +327,7 @@ def test_photographs(tmp_path, data):
     file.write_bytes(data.draw(damaged(PICTURES[form]), "content"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        image = read_or_told(lambda: read_image(file), file)
+        image = read_or_reported(lambda: read_image(file), file)
     if image is not None:
         assert image.mode in ("RGB", "RGBA") and min(image.size) > 0
 
@@ -339,7 +338,7 @@ def test_images_of_views(tmp_path_factory, content):
     folder = tmp_path_factory.mktemp("views")
     file = folder / "000.png"
     file.write_bytes(content)
-    decoded = read_or_told(lambda: decoded_views([file], 8, folder / "cache"), file)
+    decoded = read_or_reported(lambda: decoded_views([file], 8, folder / "cache"), file)
     assert file.read_bytes() == content
     if decoded is None:
         assert not list((folder / "cache").glob("*.npy"))

@@ -34,7 +34,7 @@ def refine(prior: ExactPrior, steps: int, **settings) -> GaussNewton:
     return GaussNewton(ExactModel(), prior, iterations=0, refinement_steps=steps, **settings)
 
 
-def test_it_converges_faster_than_any_power():
+def test_convergence_is_quadratic():
     """Each step squares the error, up to what the damping leaves (it falls to a third each time)."""
     pairs, true = exact_pairs(6, torch.float64)
     starts = true[:, None] + torch.tensor([[0.3, 0.8, -0.1], [-0.2, -0.9, 0.1]], dtype=torch.float64)
@@ -114,7 +114,7 @@ def test_from_inside_its_basin_it_finds_the_minimum_and_from_outside_the_wrong_o
     assert (solution.chosen < 2).all()
 
 
-def test_the_first_stage_leaves_the_wrong_valley():
+def test_the_first_stage_leaves_the_wrong_basin():
     pairs, true = exact_pairs(5)
     starts = around(true, math.pi - 0.5, math.pi)
     solution = GaussNewton(ExactModel(), ExactPrior(*WRONG_VALLEY)).solve(pairs, starts, seed=0)
@@ -129,7 +129,7 @@ def test_without_steps_it_is_the_first_stage():
     torch.testing.assert_close(found.poses, alone.poses)
 
 
-def test_where_the_prior_does_not_depend_on_the_pose_nothing_moves():
+def test_poses_stay_where_the_energy_is_constant():
     pairs, true = exact_pairs(2)
     starts = around(true, 0.5)
     solution = refine(Flat(), 5).solve(pairs, starts, seed=0)
@@ -244,7 +244,7 @@ def test_bad_settings_are_named(settings, message):
         GaussNewton(ExactModel(), ExactPrior(), **settings)
 
 
-def test_no_step_waits_for_the_device_or_mixes_devices(monkeypatch):
+def test_no_step_synchronizes_or_mixes_devices(monkeypatch):
     """On the meta device, where a value that is asked for and a tensor from elsewhere are errors."""
     meta = torch.device("meta")
     pairs, true = exact_pairs(2)

@@ -53,7 +53,7 @@ def test_rotation_error_is_the_angle_turned(batch: tuple[int, ...], degrees: flo
 
 
 @pytest.mark.parametrize("degrees", [1e-6, 1e-4, 1e-3, 1e-2])
-def test_tiny_angles_are_seen_in_float32(degrees: float) -> None:
+def test_tiny_angles_are_resolved_in_float32(degrees: float) -> None:
     # About a camera whose entries are exact in float32; arccos would read 0 for all of these.
     turned = so3_exp(torch.tensor([0.0, 0.0, math.radians(degrees)]))
     assert rotation_error(turned, torch.eye(3)).item() == pytest.approx(degrees, rel=1e-5)
@@ -74,7 +74,7 @@ def test_half_turns_stay_in_range_in_float32() -> None:
 
 @law
 @given(predicted=twists, true=twists, motion=twists)
-def test_errors_are_symmetric_and_do_not_see_the_frame_of_the_world(
+def test_errors_are_symmetric_and_independent_of_the_world_frame(
     predicted: Tensor, true: Tensor, motion: Tensor
 ) -> None:
     predicted, true, motion = se3_exp(predicted), se3_exp(true), se3_exp(motion)

@@ -201,7 +201,7 @@ def test_geodesic_angle_is_differentiable_and_finite_at_its_kink() -> None:
 
 @given(twists)
 @law
-def test_rotations_are_known_and_what_is_none(xi: Tensor) -> None:
+def test_is_rotation(xi: Tensor) -> None:
     rotation = so3_exp(xi[3:])
     scaled, mirrored, sheared = 1.01 * rotation, -rotation, rotation + 0.01 * torch.eye(3, dtype=torch.float64)[0]
     found = is_rotation(torch.stack([rotation, scaled, mirrored, sheared, torch.full((3, 3), math.nan).double()]))

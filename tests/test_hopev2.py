@@ -85,7 +85,7 @@ def test_relative_radii_follow_the_distances(make, tmp_path):
     assert len(inside) >= 2 and np.ptp(inside) < 1e-9
 
 
-def test_a_download_is_left_alone_and_converted_once(make, root, tmp_path):
+def test_a_download_is_unchanged_and_converted_once(make, root, tmp_path):
     before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
     with pytest.warns(UserWarning):
         make().prepare()
@@ -127,7 +127,7 @@ def scaled(factor: float, *keys: str):
         (1.0, 0.001, "models in millimetres, cam_t_m2c in metres"),
     ],
 )
-def test_metres_are_told_from_millimetres_by_the_masks(make, root, tmp_path, model, pose, units):
+def test_masks_distinguish_metres_from_millimetres(make, root, tmp_path, model, pose, units):
     rewrite(root / "models" / "models_info.json", scaled(model))
     for folder in root.glob("val*/*"):
         rewrite(folder / "scene_gt.json", scaled(pose, "cam_t_m2c"))
@@ -171,7 +171,7 @@ def test_numbers_of_images_may_be_padded_with_zeros(make, root, tmp_path, files)
 
 @pytest.mark.filterwarnings("ignore:.*are left out")
 @pytest.mark.parametrize("values", [np.uint8([0, 1]), np.uint16([0, 65535])])
-def test_masks_of_zeros_and_ones_or_of_16_bits_mark_the_same_pixels(make, root, tmp_path, values):
+def test_masks_of_zeros_and_ones_or_of_16_bits_select_the_same_pixels(make, root, tmp_path, values):
     make().prepare()
     for file in root.glob("val*/*/mask_visib/*.png"):
         Image.fromarray(values[(np.asarray(Image.open(file)) > 0).astype(int)]).save(file)
@@ -297,7 +297,7 @@ def test_objects_that_cannot_be_converted_are_listed_and_the_others_are_ready(ma
         make(objects=["obj_000004"]).names()
 
 
-def test_what_is_wrong_for_all_objects_is_said_once(make, root):
+def test_an_error_common_to_all_objects_is_reported_once(make, root):
     write_models(root, 1, 2)
     scene(root, "scene_gt.json").write_text("{")
     with pytest.raises(UserError, match=r"2 of 2 objects .*json: obj_000001, obj_000002: .*is not readable JSON"):
@@ -322,7 +322,7 @@ def test_wrong_roots(make, root, tmp_path):
         make(splits=["train"]).prepare()
 
 
-def test_views_too_near_or_too_distorted_are_left_out_and_counted():
+def test_views_too_near_or_too_distorted_are_skipped_and_counted():
     cameras = [camera_to_world(torch.tensor([0.2, angle, 6.0], dtype=torch.float64)) for angle in (0.0, 1.0, 2.0)]
     cameras += [camera_to_world(torch.tensor([0.2, 3.0, distance], dtype=torch.float64)) for distance in (0.7, 1.5)]
     photographs = [Photograph(Path("image"), Path("mask"), each, torch.eye(3).double(), SIZE) for each in cameras]

@@ -1,4 +1,4 @@
-"""The page of a run: self-contained and whole in itself, and alive in a browser where there is one."""
+"""The page of a run: self-contained and complete, and interactive in a browser, if installed."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ DEEP, DEEP_YAML = "[" * 100_000, "a: " + "[" * 3000  # deeper than their readers
 
 
 class Page(HTMLParser):
-    """A page taken apart: its elements, and that they are closed in order."""
+    """Parses a page into elements and checks that they are closed in order."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ def page_of(folder: Path) -> Page:
 # ---------------------------------------------------------------- examples on disk
 
 
-def test_examples_come_back_as_they_were_saved(tmp_path):
+def test_examples_round_trip(tmp_path):
     saved = example(NASTY, 170.0)
     query = dataclasses.replace(saved.query, field_of_view=0.5)
     saved = dataclasses.replace(saved, query=query)
@@ -125,7 +125,7 @@ def test_saving_replaces_the_examples_of_an_earlier_run(tmp_path):
 # ---------------------------------------------------------------- examples of an evaluation
 
 
-class Tells(torch.nn.Module):
+class Reader(torch.nn.Module):
     """A score model that reads the pose off the image as `ExactPrior` does."""
 
     has_energy, has_density, sigma, choose_by = False, False, 1.0, "distance"
@@ -144,7 +144,7 @@ class Tells(torch.nn.Module):
         return None
 
 
-class Told(PairBatch):
+class WithPoses(PairBatch):
     """Images that say their poses; pixels would round them."""
 
     @property
@@ -156,7 +156,7 @@ class Exact(PairData):
     """Views whose images say their poses."""
 
     def __getitem__(self, pairs):
-        return Told(**vars(super().__getitem__(pairs)))
+        return WithPoses(**vars(super().__getitem__(pairs)))
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def evaluation() -> tuple[Evaluation, PairData]:
         kind = "unique" if unique else "continuous"
         objects.append(ObjectViews(name, "test", kind, unique, files, camera_to_world(poses), torch.full((3,), 0.857)))
     data = Exact(ViewTable(objects), np.zeros((24, 8, 8, 3), dtype=np.uint8), None)
-    solver = TwoStage(Tells(), ExactPrior((0.0, torch.pi), (0.0, 0.3)), gamma=0.0, iterations=12, refinement_steps=8)  # type: ignore[arg-type]
+    solver = TwoStage(Reader(), ExactPrior((0.0, torch.pi), (0.0, 0.3)), gamma=0.0, iterations=12, refinement_steps=8)  # type: ignore[arg-type]
     evaluation = Evaluation(solver, Ring(3), seed=0)
     evaluation.gather_for(data.table)
     with torch.no_grad():
@@ -213,7 +213,7 @@ def test_a_prior_that_would_take_long_has_no_landscape(evaluation, monkeypatch):
     assert all("energy of the prior" not in each.landscapes for each in gather_examples(evaluation, data))
 
 
-def test_the_solver_stays_as_it_was(evaluation):
+def test_the_solver_is_unchanged(evaluation):
     solver = evaluation[0].solver
     recorded = recording(solver)
     assert recorded.first.trajectory and recorded.second.trajectory
@@ -236,7 +236,7 @@ def test_other_objects_add_their_worst_pairs_those_with_a_unique_answer_first():
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_a_page_is_whole_in_itself(kind, tmp_path):
+def test_a_page_is_self_contained(kind, tmp_path):
     folder = WRITERS[kind](tmp_path / "run")
     page = page_of(folder)
     assert (folder / "report.html").stat().st_size < LARGEST
@@ -389,7 +389,7 @@ def test_runs_are_known_by_their_command_or_by_their_files(tmp_path):
     assert {folder.name: kind for folder, kind in run_folders([tmp_path])} == kinds
 
 
-def test_a_set_of_runs_has_each_of_them_to_be_opened(tmp_path):
+def test_a_page_of_several_runs_has_a_section_for_each(tmp_path):
     runs = [(write_evaluation(tmp_path / f"e{seed}", seed), "eval") for seed in range(2)]
     runs.append((write_training(tmp_path / "t"), "train"))
     page = Page(write_report_page(tmp_path / "report.html", runs, {}))
@@ -398,7 +398,7 @@ def test_a_set_of_runs_has_each_of_them_to_be_opened(tmp_path):
     assert opened == links and len(opened) == 3
 
 
-def test_runs_that_would_make_the_page_too_large_are_in_the_table_alone(tmp_path, monkeypatch):
+def test_runs_that_would_make_the_page_too_large_are_only_in_the_table(tmp_path, monkeypatch):
     runs = [(write_evaluation(tmp_path / f"e{seed}", seed), "eval") for seed in range(3)]
     sizes = [len(Page(write_report_page(tmp_path / "one.html", runs[:1], {})).text)]
     monkeypatch.setattr(page_module, "LARGEST", sizes[0] - 2_000_000)  # without plotly.js: room for one

@@ -33,7 +33,7 @@ def unused(pairs: Pairs) -> torch.Tensor:
 # ---------------------------------------------------------------- two images
 
 
-def test_it_finds_the_answer_and_keeps_five():
+def test_it_finds_the_answer_and_keeps_five_candidates():
     pairs, true = exact_pairs(6)
     solution = solver().solve(pairs, unused(pairs), seed=0)
     assert solution.poses.shape == (6, 5, 3)
@@ -67,7 +67,7 @@ def test_candidates_are_the_published_grid():
     assert {int(each) % 360 for each in poses[..., 1].flatten()} <= set(range(0, 360, 60))
 
 
-def test_the_better_half_of_what_is_probed_stays():
+def test_the_better_half_of_the_candidates_is_explored():
     pairs, _ = exact_pairs(3)
     prior = ExactPrior(*WRONG_VALLEY)
     everything = solver(prior, candidates="starts", exploration_steps=0, kept=100, refinement_steps=0)
@@ -113,7 +113,7 @@ def test_probing_and_steps_meet_the_published_timesteps(monkeypatch):
 
 
 def test_steps_are_the_gradient_of_one_direction_times_the_rate():
-    """Two steps by hand on an energy whose directions have their valleys on either side of the truth."""
+    """Two steps by hand on an energy whose two directions have their minima on either side of the truth."""
     pairs, true = exact_pairs(2, torch.float64)
     prior = ExactPrior([0.4])
     start = around(true, 0.9)
@@ -153,7 +153,7 @@ def test_any_batching_and_order_gives_the_same_answers():
         torch.testing.assert_close(part.poses, whole.poses[index], rtol=0, atol=1e-5)
 
 
-def test_candidates_where_the_prior_fails_are_left_out():
+def test_candidates_where_the_prior_fails_are_dropped():
     pairs, true = exact_pairs(3)
     starts = around(true, 0.2, 0.3, 0.5, 0.6, 1.0, 1.1)
     starts[1, 0, 0] = 2.0
@@ -185,8 +185,8 @@ def test_sets_of_images_are_solved_together(views):
     assert torch.equal(solution.energies.nan_to_num(), solution.energies.mT.nan_to_num())
 
 
-def test_the_others_help_to_choose_between_two_valleys():
-    """Noise shows to the first pair the wrong valley as the deeper one; with the third image it is out of place."""
+def test_other_images_help_to_choose_between_two_minima():
+    """Noise makes the wrong minimum of the first pair deeper; it is inconsistent with the third image."""
     alone = torch.tensor([[[1.0, 0.9], [0.5, 2.0]]])
     between = torch.tensor([[[[0.1, 0.8], [1.5, 1.0]]]])
     assert triangular_choice(alone, between[:, :0], []).tolist() == [[1, 0]]
@@ -200,7 +200,7 @@ def test_an_image_without_a_good_candidate_does_not_count_against_the_others():
     assert triangular_choice(alone, between, [(0, 1)]).tolist() == [[0, 0]]  # 0.3 against 0.6, not 14 against 9
 
 
-def test_what_failed_is_not_chosen():
+def test_failed_candidates_are_not_chosen():
     alone = torch.tensor([[[torch.nan, 0.9], [0.5, 2.0]]])
     between = torch.full((1, 1, 2, 2), torch.nan)
     assert triangular_choice(alone, between, [(0, 1)]).tolist() == [[1, 0]]

@@ -42,7 +42,7 @@ def test_radius_maps_are_inverted_and_rise(radius_map):
     assert radius_map.norm(torch.zeros(1)).item() == 1
 
 
-def test_the_radius_map_of_the_hand_over_has_a_slope_everywhere_and_keeps_within_one():
+def test_the_second_stages_radius_map_has_a_positive_slope_and_is_bounded():
     norm = torch.logspace(-3, 3, 200, dtype=torch.float64).requires_grad_()
     radius = TanhRadius().radius(norm)
     torch.testing.assert_close(radius, (norm.square() - 1) / (norm.square() + 1))
@@ -187,7 +187,7 @@ def test_any_batching_and_order_gives_the_same_answers():
             assert torch.equal(part.chosen, whole.chosen[index])
 
 
-def test_starts_do_not_influence_one_another_and_meet_the_same_noise():
+def test_starts_are_independent_and_share_the_noise():
     pairs, true = exact_pairs(3)
     starts = around(true, -0.9, 0.4, 2.0, 0.4)
     solver = IFusion(ExactPrior(noisy=0.3), steps=40)
@@ -207,8 +207,8 @@ def test_results_depend_on_the_seed_alone(fresh_noise):
     assert not torch.equal(first.poses, other.poses)
 
 
-def test_without_fresh_noise_the_landscape_stands_still():
-    """Noise moves the exact prior's valley: a fixed one leads to a fixed place, off the truth."""
+def test_without_fresh_noise_the_landscape_is_fixed():
+    """Noise moves the exact prior's minimum: fixed noise gives a fixed end, off the truth."""
     pairs, true = exact_pairs(4)
     solver = IFusion(ExactPrior(noisy=0.2), fresh_noise=False)
     solution = solver.solve(pairs, around(true, 0.3, -0.3), seed=0)
@@ -259,7 +259,7 @@ def test_it_descends_in_inference_mode():
 
 
 def test_rescoring_compares_final_poses_and_not_trajectories():
-    """A long way to the right valley costs more in sum than a start that sits at the bottom of a wrong one."""
+    """A long trajectory to the right minimum has a larger sum of losses than a start at a wrong minimum."""
     pairs, true = exact_pairs(6)
     starts = around(true, 1.4, math.pi)
     starts[:, 1, ::2] = true[:, ::2]
@@ -303,7 +303,7 @@ def test_a_start_where_the_prior_fails_stops_alone_and_is_reported(what):
     assert solution.chosen[1] != 2
 
 
-def test_a_start_that_walks_into_failure_keeps_its_last_pose():
+def test_a_start_that_fails_later_keeps_its_last_valid_pose():
     pairs, true = exact_pairs(4)
     limit = 0.6 * true[:, 0].abs().min().item()
     solution = IFusion(FailingPrior(limit), steps=60, learning_rate=0.01, trajectory=True).solve(

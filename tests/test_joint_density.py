@@ -26,7 +26,7 @@ def density(logits: list[torch.Tensor], mean: torch.Tensor | None = None) -> Pos
     return PoseDensity(torch.stack(logits), mean, torch.full((len(logits), 2), 0.1), 0.15)
 
 
-def test_two_views_tell_the_mean_of_both_directions():
+def test_two_views_give_the_mean_of_both_directions():
     forth, back = peaks((100, 0.7), (280, 0.3)), peaks((260, 0.5), (80, 0.5))
     found = joint_density(density([forth, back]), 1, torch.tensor([3]), seed=0)
     mirrored = torch.tensor([back[-each % GRID] for each in range(GRID)])
@@ -35,8 +35,8 @@ def test_two_views_tell_the_mean_of_both_directions():
     assert found.deviation.flatten().tolist() == pytest.approx([0.1, 0.1])
 
 
-def test_all_pairs_together_tell_what_a_pair_cannot():
-    """Pairs with the first view prefer half a turn; the others know their place, and one near pair is sure."""
+def test_all_pairs_together_resolve_what_one_pair_cannot():
+    """Pairs with the first view prefer half a turn; the other pairs are right, and one near pair is certain."""
     places = [0.0, 120.0, 200.0, 330.0]
     wrong = {(0, 1), (1, 0), (0, 2), (2, 0)}
     logits = []

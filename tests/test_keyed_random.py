@@ -17,7 +17,7 @@ MANY = torch.arange(20_000)
 @pytest.mark.parametrize(
     ("draw", "law"), [(keyed_uniform, stats.uniform), (keyed_normal, stats.norm)], ids=["uniform", "normal"]
 )
-def test_draws_follow_their_law_along_keys_and_along_counts(draw, law, seed):
+def test_draws_follow_their_distribution_along_keys_and_counts(draw, law, seed):
     for sample in (draw(seed, MANY, count=1)[:, 0], draw(seed, 5, count=20_001)):
         assert stats.kstest(sample.numpy(), law.cdf).pvalue > 1e-3
 
@@ -62,7 +62,7 @@ def test_one_flipped_bit_of_a_key_flips_half_of_the_bits():
         assert abs(flips - 0.5) < 0.02, bit
 
 
-def test_no_two_keys_meet():
+def test_no_two_keys_collide():
     grid = torch.arange(300)
     bits = keyed_bits(grid[:, None, None], grid[:, None], 0, count=3)
     assert len(torch.unique(bits)) == bits.numel()
@@ -117,7 +117,7 @@ def test_the_first_bits_of_splitmix64():
     assert [value % 2**64 for value in keyed_bits(count=3).tolist()] == published
 
 
-def test_draws_stay_what_they_were():
+def test_draws_are_unchanged_between_versions():
     # Source: this package, as first published. They must never change: the results of old runs hang on them.
     assert stable_id("cup/000.png cup/001.png") == 8734955151959690502
     assert keyed_bits(0, 7, 3, count=2).tolist() == [-3271839209435239565, -2266794861325250843]

@@ -51,7 +51,7 @@ def test_the_papers_grid():
         ({"latitude_limit_degrees": 0.0}, "latitudes need a limit between 0 and 180 degrees and a step no larger"),
     ],
 )
-def test_grids_that_are_none(settings, sentence):
+def test_invalid_grids(settings, sentence):
     with pytest.raises(UserError, match=sentence):
         landscape_grid(**settings)
 
@@ -88,7 +88,7 @@ def test_wells_are_counted(given_wells):
     assert heights == sorted(heights) and heights[0] == 0
 
 
-def test_a_well_of_half_the_depth_stands_out_by_half():
+def test_a_well_of_half_the_depth_has_half_the_prominence():
     deep, shallow = wells((0, 60, 1.0), (0, 240, 0.5), width=8.0).minima()
     assert math.degrees(deep.longitude) == pytest.approx(60, abs=0.5)
     assert shallow.height == pytest.approx(0.5, abs=0.01) and shallow.prominence == pytest.approx(0.5, abs=0.01)
@@ -103,7 +103,7 @@ def test_a_well_on_the_border_counts():
     assert len(places(wells((60, 0, 1.0), (-60, 180, 0.9)))) == 2
 
 
-def test_a_saddle_is_no_minimum():
+def test_a_saddle_is_not_a_minimum():
     """Between two wells there is a pass; a landscape of cosines has as many passes as wells."""
     assert len(wells((0, 90, 1.0), (0, 150, 0.9), width=8.0).minima()) == 2
     latitude, longitude = GRID
@@ -122,26 +122,26 @@ def test_equal_energies_side_by_side_are_one_minimum():
     assert len(of([[2, 2, 2], [1, 1, 1], [2, 2, 2]]).minima()) == 1  # a valley all around
 
 
-def test_between_two_equal_points_lies_the_bottom():
+def test_the_minimum_lies_between_two_equal_points():
     landscape = wells((4.0, 90.0, 1.0))  # latitudes 4 and longitudes 84, 96 are on the grid
     ((_, longitude),) = places(landscape)
     assert longitude == pytest.approx(90, abs=1e-3)
 
 
-def test_a_dent_does_not_count_and_a_plain_has_none():
+def test_shallow_dips_do_not_count_and_a_flat_landscape_has_no_minimum():
     deep, shallow = (0, 60, 1.0), (0, 240, 0.03)
     assert len(wells(deep, shallow, width=8.0).minima()) == 1
     assert of([[1.0] * 6] * 4).minima() == []
 
 
-def test_what_is_not_finite_is_passed_over():
+def test_non_finite_energies_are_ignored():
     landscape = wells((0, 60, 1.0), (0, 240, 0.5), width=8.0)
     landscape.energy[:, 0] = math.nan
     landscape.energy[-1] = math.inf
     assert len(landscape.minima()) == 2
 
 
-def test_the_floor_is_the_lowest_ground_at_each_longitude():
+def test_the_floor_is_the_lowest_energy_at_each_longitude():
     assert of([[3, 1, 2], [5, 4, 0], [2, 2, 2]]).floor().tolist() == pytest.approx([0.4, 0.2, 0.0])
     assert of([[1.0] * 3] * 2).floor().tolist() == [0, 0, 0]
 

@@ -102,7 +102,7 @@ def test_a_pair_of_photographs_has_no_truth(commands):
     assert {each["rotation_error"] for each in summary["descents"]} == {None}
 
 
-def test_a_start_that_came_to_no_pose_is_left_out():
+def test_a_start_without_a_final_pose_is_dropped():
     starts = torch.tensor([[[0.0, 0, 0], [0, 1, 0], [0, 2, 0]]])
     poses = starts.clone()
     poses[0, 1] = math.nan

@@ -1,4 +1,4 @@
-"""The first stage with models whose field is known: its decay, its spread, its independence, its choice."""
+"""The first stage with known fields: decay, spread, independence of starts, choice of the answer."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ExactEnergy(Exact):
 
 
 class OnTheCircle(Exact):
-    """The score of the wrapped kernel, which is nothing at the truth and nothing at its antipode."""
+    """The score of the wrapped kernel, which is 0 at the truth and at its antipode."""
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         return FieldValue(PoseKernel("periodic", self.sigma).score(pose, condition), None)
@@ -62,7 +62,7 @@ class FailsFarAway(Exact):
 
 
 class Misled(Exact):
-    """Pulls poses with a longitude above 4 to 5, where it is as sure of itself as at the truth."""
+    """Pulls poses with a longitude above 4 to 5, where it is as confident as at the truth."""
 
     def field(self, condition: Tensor, pose: Tensor) -> FieldValue:
         wrong = torch.tensor([0.0, 5.0, 0.0]).to(pose)
@@ -193,7 +193,7 @@ def test_image_features_are_computed_once_an_image():
     assert solution.cost.seconds > 0
 
 
-def test_longitudes_come_back_within_a_turn():
+def test_longitudes_are_reduced_to_one_turn():
     problem, _ = pairs(50)
     problem.images[1:, 1] += torch.linspace(-20, 20, 50)[:, None, None]
     solution = Langevin(Exact(), gamma=0, iterations=200).solve(problem, random_starts(50, 2), seed=0)
@@ -225,7 +225,7 @@ def distances(solver: Langevin, problem: Pairs, true: Tensor, starts: Tensor) ->
     return chosen, every
 
 
-def test_the_least_distance_chooses_the_start_that_ended_nearest():
+def test_the_smallest_estimated_distance_chooses_the_nearest_end():
     problem, true = pairs(100)
     solver = Langevin(Exact(), gamma=(0.2, 0.2, 0.2), iterations=20, choose_by="distance")
     chosen, every = distances(solver, problem, true, random_starts(100, 6))
@@ -246,8 +246,8 @@ def test_the_distance_rises_up_to_the_antipode(model, sigma):
     torch.testing.assert_close(distance[:, -1], torch.full((2,), math.pi, dtype=torch.float64), rtol=0.05, atol=0)
 
 
-def test_an_end_at_the_antipode_is_not_the_answer():
-    """There the score vanishes, as it does at the truth."""
+def test_an_end_at_the_antipode_is_not_chosen():
+    """The score vanishes there, as at the truth."""
     problem, true = pairs(4, torch.float64)
     starts = true[:, None].repeat(1, 3, 1)
     starts[..., 1] += torch.tensor([math.pi, math.pi - 0.01, 2.0])
@@ -255,7 +255,7 @@ def test_an_end_at_the_antipode_is_not_the_answer():
     assert (solution.chosen == 2).all()
 
 
-def test_agreement_passes_over_a_minority_that_ended_wrong():
+def test_agreement_ignores_a_wrong_minority():
     problem, true = pairs(40)
     starts = random_starts(40, 5)  # longitudes up to 3: to the truth
     starts[::2, :2, 1] = 5.0  # two of five are misled
@@ -276,7 +276,7 @@ def test_agreement_beats_a_random_start_with_noise():
     assert chosen.mean() < 0.9 * every.mean()
 
 
-def test_an_energy_model_chooses_the_least_energy():
+def test_an_energy_model_chooses_the_lowest_energy():
     problem, true = pairs(50)
     solver = Langevin(ExactEnergy(), gamma=(0.2, 0.2, 0.2), choose_by="energy")
     chosen, every = distances(solver, problem, true, random_starts(50, 6))

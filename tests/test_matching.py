@@ -1,4 +1,4 @@
-"""The matching model: votes, mirrored maps, where its density leads solvers, and what its training is taught by."""
+"""The matching model: votes, mirrored maps, solvers on its density, and its training losses."""
 
 import math
 from functools import partial
@@ -140,7 +140,7 @@ def test_modes_stay_separate_with_little_smoothing_and_the_energy_chooses(bimoda
     assert solution.chosen.tolist() == [1]
 
 
-def test_ends_come_with_their_probability(bimodal: Bimodal):
+def test_final_poses_have_a_probability(bimodal: Bimodal):
     starts = Modes(bimodal, count=2).make(a_pair(), seed=0)
     solution = Langevin(bimodal, gamma=0.0, sigma=0.15).solve(a_pair(), starts, seed=0)
     assert solution.probability is not None
@@ -151,7 +151,7 @@ def test_ends_come_with_their_probability(bimodal: Bimodal):
 
 
 class Undecided(Bimodal):
-    """Told the longitudes of views by their images; pairs that are far apart prefer half a turn more."""
+    """Reads longitudes from the images; pairs that are far apart prefer half a turn more."""
 
     def encode(self, images):
         return images[:, 0, 0, 0]
@@ -166,7 +166,7 @@ class Undecided(Bimodal):
 
 
 @pytest.mark.parametrize("solver", ["langevin", "multiview"])
-def test_several_views_decide_what_a_pair_gets_wrong(solver: str):
+def test_several_views_correct_a_wrong_pair(solver: str):
     model = Undecided(EfficientNetLite0Maps(), width=32, layers=1)
     longitudes = torch.tensor([0.0, 60.0, 120.0, 180.0]).deg2rad()
     images = longitudes[:, None, None, None].expand(-1, 3, 8, 8)
@@ -194,7 +194,7 @@ def test_a_mirror_image_has_the_mirrored_density(model: MatchingModel):
     torch.testing.assert_close(other.mean, one.mean, rtol=0, atol=1e-5)
 
 
-def test_temperature_evens_the_density(model: MatchingModel):
+def test_temperature_flattens_the_density(model: MatchingModel):
     images = 2 * torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
     hot = MatchingModel(EfficientNetLite0Maps(), width=32, layers=1, cells=64, temperature=2.0).eval()
     hot.load_state_dict(model.state_dict())
@@ -206,7 +206,7 @@ def test_temperature_evens_the_density(model: MatchingModel):
     torch.testing.assert_close(logits[1], (logits[0] / 2).log_softmax(-1), rtol=0, atol=1e-5)
 
 
-def test_other_models_refuse_what_they_do_not_know():
+def test_other_models_refuse_density_methods():
     model = ScoreModel(EfficientNetLite0(hidden=8, features=4), hidden=8, layers=1)
     starts = torch.zeros(1, 1, 3)
     assert Langevin(model).solve(a_pair(), starts, seed=0).probability is None

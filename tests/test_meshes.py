@@ -201,7 +201,7 @@ def test_coinciding_faces_are_dropped_and_turned_ones_are_twins():
 # ---------------------------------------------------------------- fingerprint and objects
 
 
-def test_fingerprint_tells_shape_and_colour_apart_and_is_repeatable():
+def test_the_fingerprint_depends_on_shape_and_colour_and_is_reproducible():
     red, same, blue = coloured_box(), coloured_box(), coloured_box(colour=(0, 0, 255, 255))
     longer = coloured_box((1, 1, 2))
     prints = [fingerprint(trimesh.Scene(mesh)) for mesh in (red, same, blue, longer)]
@@ -209,7 +209,7 @@ def test_fingerprint_tells_shape_and_colour_apart_and_is_repeatable():
     json.dumps(prints)
 
 
-def test_objects_travel_to_other_processes(tmp_path):
+def test_objects_can_be_pickled(tmp_path):
     coloured_box().export(tmp_path / "box.ply")
     obj = MeshObject("box", "unlabelled", partial(load_scene, tmp_path / "box.ply"))
     assert fingerprint(pickle.loads(pickle.dumps(obj)).load()) == fingerprint(obj.load())

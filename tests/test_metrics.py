@@ -205,7 +205,7 @@ def test_rows_are_sorted_whole_and_up_to_date():
 
 
 @pytest.mark.parametrize("copied", [lambda each: pickle.loads(pickle.dumps(each)), copy.deepcopy, PoseMetrics.clone])
-def test_pickled_and_cloned_metrics_go_on(copied):
+def test_pickled_and_cloned_metrics_can_be_updated(copied):
     given = rows()
     metrics = copied(fed(tuple(each[:30] for each in given)))
     metrics.update(solved(tuple(each[30:] for each in given)))
@@ -260,7 +260,7 @@ SHARE = """
 
 
 @pytest.mark.heavy
-def test_two_processes_give_the_result_of_one_and_count_the_filling_up_once(tmp_path):
+def test_two_processes_give_the_result_of_one_and_count_padding_once(tmp_path):
     given = rows(pairs=53)
     (tmp_path / "given.pickle").write_bytes(pickle.dumps((NAMES, AMBIGUITIES, UNIQUE, given)))
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
@@ -285,7 +285,7 @@ def test_two_processes_give_the_result_of_one_and_count_the_filling_up_once(tmp_
 # ---------------------------------------------------------------- on disk
 
 
-def test_what_is_not_finite_is_null_on_disk(tmp_path):
+def test_non_finite_values_are_null_on_disk(tmp_path):
     write_json(tmp_path / "results.json", {"a": math.inf, "b": [math.nan, 1.0], "c": {"d": None, "e": "x"}})
     assert json.loads((tmp_path / "results.json").read_text()) == {
         "a": None,

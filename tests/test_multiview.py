@@ -1,4 +1,4 @@
-"""Several images at once: what the fit, the joint refinement and each stage alone are worth."""
+"""Several images at once: the effect of the fit, the joint refinement and each stage alone."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_both_stages_find_all_poses_from_random_starts(views):
 
 
 def test_the_fit_averages_the_first_stages_noise_over_starts_and_pairs():
-    """One noisy end has a longitude off by 39 degrees; a fit of many, each with the weight it deserves, by a tenth."""
+    """A single noisy end has a longitude error of 39 degrees; a weighted fit of many, a tenth of it."""
     found = {}
     for views, count in ((2, 1), (2, 8), (8, 1), (8, 8)):
         sets, true = exact_sets(30, views)
@@ -111,7 +111,7 @@ def test_the_fit_overrules_pairs_where_the_model_is_wrong():
     assert (distance(together, true) > 1).double().mean() < 0.1 * wrong
 
 
-def test_ends_at_the_antipode_weigh_next_to_nothing():
+def test_ends_at_the_antipode_have_almost_no_weight():
     """Most of the starts stay where the score vanishes although the truth is half a turn away."""
     sets, true = exact_sets(6, 4)
     starts = true[:, :, None].repeat(1, 1, 3, 1)
@@ -138,7 +138,7 @@ def test_the_second_stage_corrects_what_the_first_cannot_see():
 
 
 def test_without_the_first_stage_more_images_are_lost_more_often():
-    """Each image falls into the valley of its start; the more there are, the less often all are right."""
+    """Each image ends in the basin of its start; with more images, all are right less often."""
     shares = []
     for views in (2, 5):
         sets, true = exact_sets(40, views)
@@ -152,7 +152,7 @@ def test_without_the_first_stage_more_images_are_lost_more_often():
     assert shares[1] < 0.6 * shares[0]
 
 
-def test_without_the_first_stage_the_start_of_least_energy_is_the_answer():
+def test_without_the_first_stage_the_answer_has_the_lowest_energy():
     sets, true = exact_sets(5, 3)
     prior = ExactPrior(*WRONG_VALLEY)
     solver = MultiView(ExactModel(), prior, first_stage=False)
@@ -225,7 +225,7 @@ def test_network_passes():
     assert cost.network_passes == images + 3 * second
 
 
-def test_an_image_that_the_model_does_not_understand_is_reported_and_leaves_the_others_theirs():
+def test_an_image_where_the_model_fails_is_reported_and_the_others_are_solved():
     sets, true = exact_sets(3, 4)
     unknown = sets.images.flatten(1)[sets.views[1, 2], 0].item()
     solution = MultiView(Blind(unknown), ExactPrior(), gamma=0.0).solve_views(sets, starts_of(sets), seed=0)

@@ -112,7 +112,7 @@ def test_a_periodic_embedding_repeats_after_a_turn_and_the_lines_does_not(longit
 
 
 @pytest.mark.parametrize("periodic", [True, False])
-def test_an_embedding_tells_poses_apart(periodic):
+def test_an_embedding_distinguishes_poses(periodic):
     embedding = PoseEmbedding(4, periodic)
     longitudes = torch.arange(0, 6.2, 0.1)
     embedded = embedding(torch.stack([torch.zeros_like(longitudes), longitudes, torch.zeros_like(longitudes)], -1))
@@ -136,7 +136,7 @@ def test_the_field_repeats_after_a_turn_with_the_periodic_target_alone(model):
 # ---------------------------------------------------------------- the energy model's field
 
 
-def test_the_energy_models_score_is_minus_the_slope_of_its_energy():
+def test_the_energy_models_score_is_minus_the_gradient_of_its_energy():
     torch.manual_seed(0)
     model = EnergyModel(Colors()).double().eval()
     condition, pose = torch.randn(4, 1, 256, dtype=torch.float64), torch.randn(4, 5, 3, dtype=torch.float64)
@@ -189,8 +189,8 @@ def test_descending_the_loss_brings_it_down(model, noise):
 
 
 @pytest.mark.parametrize("accumulated", [1, 2, 3])
-def test_every_micro_batch_of_a_step_has_draws_of_its_own(accumulated, monkeypatch):
-    """And the first of them those of a step without accumulation."""
+def test_micro_batches_of_a_step_have_different_draws(accumulated, monkeypatch):
+    """The first one has the draws of a step without accumulation."""
     model = ScoreModel(Colors(), hidden=8, layers=1)
     draw, noises, dropout_seeds = model.noised_pose.draw, [], []
 
@@ -255,7 +255,7 @@ def test_images_of_another_size_are_resized():
 
 
 @pytest.mark.parametrize("at_once", [1, 4, 100])
-def test_how_many_images_pass_a_frozen_trunk_at_once_changes_nothing(at_once, monkeypatch):
+def test_features_do_not_depend_on_the_batch_size_of_a_frozen_trunk(at_once, monkeypatch):
     backbone = Colors()
     images = torch.rand(9, 3, 8, 8, generator=torch.Generator().manual_seed(0)) * 2 - 1
     together = backbone.trunk_features(images)
@@ -334,7 +334,7 @@ def test_a_misspelt_setting_of_a_model_is_named(name):
 # ---------------------------------------------------------------- standardised features
 
 
-def test_standardise_knows_the_mean_and_spread_of_all_it_has_met():
+def test_standardise_uses_the_mean_and_spread_of_all_batches():
     features = 3 * torch.randn(1000, 5, generator=torch.Generator().manual_seed(0)) + 7
     layer = Standardise(5).train()
     for batch in features.split([1, 299, 130, 570]):

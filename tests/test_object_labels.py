@@ -1,4 +1,4 @@
-"""Files of labels: what they say of a folder's objects, and what is wrong with them."""
+"""Label files: the labels of a folder's objects, and errors in them."""
 
 import warnings
 from pathlib import Path
@@ -34,7 +34,7 @@ def test_labels_by_object(file):
     }
 
 
-def test_numbers_and_other_words_of_yaml_are_names_as_they_are_written(file):
+def test_numbers_and_yaml_keywords_are_names(file):
     names = ["42", "007", "1.50", "1_000", "2024-01-01", "12:30", "0x10", "yes", "null", "~", "mug"]
     file.write_text("".join(f"{name}: {{ambiguity: unique}}\n" for name in names[:-1]) + '"mug": {ambiguity: twofold}')
     labels = read_labels(file, names, Path("meshes"))

@@ -26,7 +26,7 @@ def test_a_drawn_division_is_seeded_disjoint_and_of_the_size_asked(seen, unseen)
         assert len({tuple(drawn(NAMES, seen, unseen, seed, Path("here")).unseen) for seed in range(5)}) > 2
 
 
-def test_a_division_that_cannot_be():
+def test_impossible_divisions():
     with pytest.raises(UserError, match="here: 12 objects are there, but 13 are needed"):
         drawn(NAMES, 10, 3, 0, Path("here"))
     with pytest.raises(UserError, match="must not be negative"):

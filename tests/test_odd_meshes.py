@@ -1,4 +1,4 @@
-"""Mesh files that are easily read wrong (`odd_meshes.py`): read right, the same by both renderers, or named."""
+"""Mesh files that are easily misread (`odd_meshes.py`) are read correctly, equal for both renderers, or reported."""
 
 import io
 import warnings
@@ -60,7 +60,7 @@ def test_the_plain_square_has_its_colours(plain_view):
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_odd_files_look_like_plain_ones(name, tmp_path, plain_view):
+def test_unusual_files_look_like_plain_ones(name, tmp_path, plain_view):
     scene, messages = load(ODD[name](tmp_path / "odd"))
     assert messages == []
     assert np.abs(view(scene) - plain_view).max() <= 2
@@ -308,7 +308,7 @@ def test_several_textures_of_a_ply_file_are_refused(tmp_path):
         lambda folder: write_obj(folder, mtl="newmtl m\nKe 0 0 0\nd 1\nTr 0\nmap_Kd tex.png\n"),
     ],
 )
-def test_nothing_is_said_of_materials_that_are_drawn(write, tmp_path):
+def test_supported_materials_do_not_warn(write, tmp_path):
     assert load(write(tmp_path))[1] == []
 
 

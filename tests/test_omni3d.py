@@ -76,7 +76,7 @@ def test_cameras_keep_their_relative_poses_with_z_up_made_y_up(data, root, tmp_p
     assert len(batch) == 6 and batch.images.shape[0] == 3
 
 
-def test_images_are_copied_and_the_download_is_left_alone(data, root, tmp_path):
+def test_images_are_copied_and_the_download_is_unchanged(data, root, tmp_path):
     before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
     data.evaluate_on("ordered", 0)
     data.prepare_data()

@@ -1,4 +1,4 @@
-"""Converted views are not taken for those of another download."""
+"""Converted views are not mistaken for those of another download."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def files_of(views: Path) -> list[str]:
     return json.loads(record.read_text())["files"]
 
 
-def test_views_of_another_download_of_the_same_name_are_not_taken(converted, tmp_path):
+def test_views_of_another_download_of_the_same_name_are_not_reused(converted, tmp_path):
     root, views, prepare = converted
     (record,) = views.glob("*/conversion.json")
     before = record.read_bytes()
@@ -70,7 +70,7 @@ def test_views_of_another_download_of_the_same_name_are_not_taken(converted, tmp
     assert record.read_bytes() == before
 
 
-def test_a_download_that_was_copied_or_is_not_at_hand_converts_nothing_anew(converted, tmp_path, monkeypatch):
+def test_a_copied_or_unavailable_download_is_not_converted_again(converted, tmp_path, monkeypatch):
     root, views, prepare = converted
     monkeypatch.setattr(ConvertedSource, "_write", lambda self, name: pytest.fail(f"{name} is converted anew"))
     copy = tmp_path / "copy" / "download"
@@ -82,7 +82,7 @@ def test_a_download_that_was_copied_or_is_not_at_hand_converts_nothing_anew(conv
         prepare(root)
 
 
-def test_files_are_read_only_where_they_are_not_as_they_were(tmp_path, monkeypatch):
+def test_files_are_read_only_if_their_stats_changed(tmp_path, monkeypatch):
     file = tmp_path / "a.bin"
     np.arange(9).tofile(file)
     record = Origin([file], Origin([])).record()

@@ -1,4 +1,4 @@
-"""Paths on the command line reach the configuration as they were typed."""
+"""Paths on the command line reach the configuration unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is built and installed: the wheel with its configs, a plugin as a package, a torchvision that fits or not."""
+"""Packaging: the wheel with its configs, a plugin as a package, compatible and incompatible torchvision."""
 
 from __future__ import annotations
 

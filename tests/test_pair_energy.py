@@ -18,7 +18,7 @@ def poses(batch: int, starts: int) -> torch.Tensor:
 
 
 def uneven() -> ExactPrior:
-    """A prior whose two directions differ: its valleys do not lie evenly about the truth."""
+    """A prior whose two directions differ: its minima are not symmetric about the truth."""
     return ExactPrior([0.0, 2.0], [0.0, 0.3], noisy=0.3)
 
 
@@ -87,8 +87,8 @@ def test_noise_depends_on_the_pair_and_not_on_its_place_in_a_batch():
     assert torch.equal(whole.noise(7, count=2), whole.noise(7, count=6)[:, :2])
 
 
-def test_noise_asks_nothing_of_the_device():
-    """On a GPU that would wait, at every step, for all that has been asked for."""
+def test_noise_does_not_synchronize_with_the_device():
+    """On a GPU, this would synchronize at every step."""
     pairs, _ = exact_pairs(2)
     energy = PairEnergy(ExactPrior(), pairs, seed=3)
     here = energy.noise(7, count=2)
@@ -124,7 +124,7 @@ def test_images_made_in_inference_mode_still_allow_gradients():
 
 
 @pytest.mark.parametrize("timestep", [-1, 1000])
-def test_timesteps_that_the_prior_does_not_have(timestep):
+def test_invalid_timesteps(timestep):
     pairs, _ = exact_pairs(1)
     energy = PairEnergy(ExactPrior(), pairs, seed=0)
     with pytest.raises(UserError, match=f"this prior has timesteps 0 to 999, got {timestep}"):

@@ -204,7 +204,7 @@ def test_a_view_serves_at_least_a_block_of_pairs(counts, block):
         assert len(batch) / len(np.unique(batch)) >= block
 
 
-def test_batches_have_about_the_size_that_is_asked_for():
+def test_batches_have_about_the_requested_size():
     sizes = [len(batch) for batch in BlockSampler(table_of(208, 208), 1024, 8, seed=0)]
     assert abs(np.mean(sizes) / 1024 - 1) < 0.1 and max(sizes) < 1.2 * 1024 and min(sizes) > 0.8 * 1024
 
@@ -234,7 +234,7 @@ def test_batches_mix_objects():
 
 
 @pytest.mark.parametrize("ranks", [2, 3, 5])
-def test_ranks_go_through_what_one_process_goes_through(ranks):
+def test_all_ranks_together_cover_the_pairs_of_one_process(ranks):
     table = table_of(11, 20)
     samplers = [BlockSampler(table, 100, 4, 1, rank, ranks) for rank in range(ranks)]
     shares = [{pair for batch in sampler for pair in listed(batch)} for sampler in samplers]

@@ -32,7 +32,7 @@ def paths(tmp_path):
 
 @pytest.fixture
 def jobs(monkeypatch):
-    """The config of every job that `eval` was run with."""
+    """The config of every job of `eval`."""
     import lp_framework.commands.eval as command
 
     jobs = []

@@ -1,4 +1,4 @@
-"""The paper's numbers as data: those that it prints, and rows that runs are compared with."""
+"""The paper's numbers as data: as printed, and the rows that runs are compared with."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_every_table_of_the_paper_is_here():
 
 
 @pytest.mark.parametrize("name", ["co3d", "hopev2", "methods", "priors", "score_energy", "unseen"])
-def test_a_table_with_a_row_a_line_is_the_papers(name):
+def test_tables_with_one_row_per_line_match_the_paper(name):
     assert values(name) == PRINTED[name]
 
 
@@ -98,7 +98,7 @@ def test_the_main_table_has_the_recalls_of_gamma_03_and_the_success_rates_of_no_
         ("stages", ("w/o Stage 1, 8", "w/o Stage 2, 8", "Stage 1 & 2, 8"), 10 * 28),
     ],
 )
-def test_recalls_are_shares_of_as_many_pairs_as_the_notes_say(name, labels, pairs):
+def test_recalls_are_consistent_with_the_numbers_of_pairs_in_the_notes(name, labels, pairs):
     """Each is a whole number over `pairs`, to the three digits printed; of 0.0625, either neighbour may be printed."""
     shares = {count / pairs for count in range(pairs + 1)}
     rows = [row for row in paper_table(name).rows if row.label in labels]

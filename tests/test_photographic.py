@@ -1,4 +1,4 @@
-"""Renderings that are made to look like photographs, and the points in space that their pixels show."""
+"""Renderings made to look like photographs, and the 3-D points seen in their pixels."""
 
 import json
 import math

@@ -54,12 +54,12 @@ def saved(image: Image.Image, file: Path, **options) -> Path:
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 240), st.integers(0, 160))
-def test_where_the_object_stands_makes_no_difference(left: int, top: int):
+def test_the_result_does_not_depend_on_the_objects_position(left: int, top: int):
     expected = crop_to_object(placed(drawn(), 120, 80), "a").image
     assert np.array_equal(crop_to_object(placed(drawn(), left, top), "a").image, expected)
 
 
-def test_how_large_the_object_is_makes_no_difference_but_for_resampling():
+def test_the_result_depends_on_the_objects_size_only_by_resampling():
     expected = on_white(crop_to_object(placed(drawn(), 10, 10), "a").image).astype(int)
     for scale in (2, 3, 5):
         larger = on_white(crop_to_object(placed(drawn(scale=scale), 0, 0, 400, 300), "a").image).astype(int)
@@ -80,7 +80,7 @@ def test_the_object_is_centred_and_its_longest_side_fills_the_published_share(wi
     assert (right - left) / (bottom - top) == pytest.approx(ratio, rel=0.1)
 
 
-def test_hidden_colours_do_not_show_and_the_background_is_white():
+def test_transparent_colours_are_invisible_and_the_background_is_white():
     image = drawn()
     hidden = image.copy()
     hidden[hidden[..., 3] == 0, :3] = [0, 255, 0]
@@ -195,13 +195,13 @@ def test_a_soft_mask_of_few_levels_is_not_taken_for_labels(factor: int):
     np.testing.assert_array_equal(opacity, np.asarray(mask))
 
 
-def test_a_picture_is_no_mask():
+def test_a_picture_is_not_a_mask():
     picture = Image.fromarray(drawn()[..., :3])
     with pytest.raises(UserError, match=r"a: its mask is a picture of more than 16 colours; a mask is black and white"):
         prepare(picture, "a", picture)
 
 
-def test_what_is_said_of_a_mask_without_object_is_true():
+def test_messages_about_masks_without_an_object():
     photograph, levels = Image.new("RGB", (300, 200)), np.asarray(placed(drawn(120, 80), 20, 30))[..., 3]
     with pytest.raises(UserError, match=r"a: none of its mask is at least half opaque \(at most 40%\)"):
         prepare(photograph, "a", Image.fromarray((levels * 0.4).astype(np.uint8)))
@@ -211,8 +211,8 @@ def test_what_is_said_of_a_mask_without_object_is_true():
 
 
 @pytest.mark.parametrize("size", [(300, 200), (900, 1200)])
-def test_stray_pixels_far_from_the_object_are_left_out(size: tuple[int, int]):
-    """In a mask as in an alpha channel; an island in a hole is no stray, nor is half of the object."""
+def test_stray_pixels_far_from_the_object_are_removed(size: tuple[int, int]):
+    """In masks and alpha channels; neither an island in a hole nor half of the object is a stray."""
     cut = np.asarray(placed(drawn(120, 80), 20, 30, *size)).copy()
     cut[60:64] = 0
     cut[66:74, 60:76, 3] = 0
@@ -310,7 +310,7 @@ def test_the_focal_length_is_that_of_exif(tags: dict[int, float], expected: floa
         assert focal is None if expected is None else focal == pytest.approx(expected)
 
 
-def test_damaged_exif_data_tell_nothing(tmp_path: Path):
+def test_damaged_exif_data_are_ignored(tmp_path: Path):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[41989] = 28
     file = saved(Image.new("RGB", (400, 300)), tmp_path / "a.jpg", exif=exif)
@@ -377,7 +377,7 @@ def test_arrays_are_images():
         (np.zeros((4, 4, 3), dtype=np.int64), r"a must be uint8, or floats in \[0, 1\], got int64"),
     ],
 )
-def test_arrays_that_are_no_images(array, error: str):
+def test_arrays_that_are_not_images(array, error: str):
     with pytest.raises(UserError, match=error):
         array_image(array, "a")
 
@@ -385,7 +385,7 @@ def test_arrays_that_are_no_images(array, error: str):
 # ---------------------------------------------------------------- mistakes
 
 
-def test_files_that_are_no_images(tmp_path: Path):
+def test_files_that_are_not_images(tmp_path: Path):
     with pytest.raises(UserError, match=r"none\.png: there is no such file$"):
         read_image(tmp_path / "none.png")
     (tmp_path / "text.png").write_text("not an image")
@@ -403,7 +403,7 @@ def test_files_that_are_no_images(tmp_path: Path):
         read_image(floats)
 
 
-def test_objects_that_are_not_there():
+def test_images_without_an_object():
     image = Image.new("RGB", (60, 40))
     black = Image.new("RGB", (60, 40))
     with pytest.raises(UserError, match="a: its mask is empty: none of it is at least half opaque"):
@@ -447,14 +447,14 @@ def test_photographs_are_those_of_a_folder_by_name_or_of_a_list_as_given(tmp_pat
     assert photograph_files(["z.png", "a.png"]) == [Path("z.png"), Path("a.png")]
 
 
-def test_photographs_are_sorted_as_people_count(tmp_path: Path):
+def test_photographs_are_sorted_naturally(tmp_path: Path):
     names = ["1.png", "2.png", "10.png", "IMG_09.png", "IMG_9.png", "IMG_10.png", "IMG_10 (2).png", "IMG_10 (10).png"]
     for name in sorted(names):
         Image.fromarray(drawn()).save(tmp_path / name)
     assert [file.name for file in photograph_files(tmp_path)] == names
 
 
-def test_photographs_of_telephones_and_browsers_are_read_or_named(tmp_path: Path):
+def test_formats_of_phones_and_browsers_are_read_or_named(tmp_path: Path):
     image = Image.fromarray(drawn()[..., :3])
     for name, kind in (("a.jfif", "jpeg"), ("b.JPE", "jpeg"), ("c.gif", "gif")):
         image.save(tmp_path / name, kind)
@@ -484,7 +484,7 @@ def test_too_few_photographs(tmp_path: Path):
 
 @pytest.mark.parametrize("names", [("a-mask.png", "b-mask.png"), ("mask_a.png", "mask_b.png"), ()])
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
-def test_masks_of_other_names_are_told_and_not_passed_over(names: tuple[str, ...], mode: str, tmp_path: Path):
+def test_masks_with_other_names_are_reported(names: tuple[str, ...], mode: str, tmp_path: Path):
     """Whether or not the photographs have alpha channels, which would do."""
     (tmp_path / "masks").mkdir()
     for name in names:
@@ -579,7 +579,7 @@ def test_masks_are_found_by_name(tmp_path: Path):
 
 @pytest.fixture
 def rembg(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
-    """A stand-in that marks the brightest half, and keeps what it was asked."""
+    """A mock that selects the brightest half and records its arguments."""
     module = types.ModuleType("rembg")
     module.sessions, module.modes = [], []  # type: ignore[attr-defined]
 
@@ -599,7 +599,7 @@ def rembg(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     mask_maker.cache_clear()
 
 
-def test_the_background_is_removed_where_nothing_else_tells(rembg):
+def test_the_background_is_removed_without_alpha_or_mask(rembg):
     cut = placed(drawn(), 20, 30)
     assert np.array_equal(prepare(cut, "a", remove_background=True), prepare(cut, "a"))
     assert rembg.sessions == []  # its network is not even loaded
@@ -613,7 +613,7 @@ def test_the_background_is_removed_where_nothing_else_tells(rembg):
     assert rembg.sessions == ["u2net"] and rembg.modes == ["RGB"] * 3
 
 
-def test_what_can_go_wrong_with_background_removal(rembg, monkeypatch: pytest.MonkeyPatch):
+def test_failures_of_background_removal(rembg, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(UserError, match="a: rembg found no background in it; give a mask"):
         prepare(Image.new("RGB", (60, 40), "white"), "a", remove_background=True)
     with pytest.raises(UserError, match="a: its mask is empty"):
@@ -628,7 +628,7 @@ def on_a_table(red: int = 200, size: int = 300) -> tuple[Image.Image, NDArray[np
     return Image.fromarray(np.where(shown[..., None], np.uint8([red, 40, 30]), noise)), shown
 
 
-def test_without_rembg_or_its_weights_a_rough_mask_is_made_and_said_once(rembg, monkeypatch, caplog, tmp_path: Path):
+def test_without_rembg_a_rough_mask_is_made_with_one_warning(rembg, monkeypatch, caplog, tmp_path: Path):
     def offline(name: str) -> None:
         raise ConnectionError("no route to host")
 
@@ -669,7 +669,7 @@ def test_a_picture_of_one_colour_has_no_rough_mask(rembg, monkeypatch: pytest.Mo
         prepare(Image.new("RGB", size, (90, 120, 40)), "a", remove_background=True)
 
 
-def test_an_object_that_the_border_cuts_off_is_told(caplog):
+def test_an_object_cut_off_by_the_border_warns(caplog):
     whole, cut = placed(drawn(80, 60), 0, 40), placed(drawn(80, 60), -20, 40)
     prepare(whole, "whole.png")
     assert caplog.messages == []  # it touches the border
@@ -679,7 +679,7 @@ def test_an_object_that_the_border_cuts_off_is_told(caplog):
     ]
 
 
-def test_a_mask_that_is_inverted_is_told(caplog):
+def test_an_inverted_mask_is_reported(caplog):
     mask = placed(drawn(80, 60), 20, 40).getchannel("A").point(lambda level: 255 - level)
     prepare(Image.new("RGB", mask.size), "a", mask)
     assert caplog.messages == ["a: the whole image border counts as the object; a mask must be white on the object"]

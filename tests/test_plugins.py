@@ -89,7 +89,7 @@ def test_classes_of_a_plugin_can_be_pickled_for_worker_processes(here, write):
 
 
 @pytest.mark.parametrize("folder", ["nowhere", "empty"])
-def test_a_folder_that_does_not_exist_or_holds_nothing_is_told(here, folder):
+def test_missing_and_empty_folders_are_reported(here, folder):
     (here / "empty").mkdir()
     with pytest.raises(UserError, match=rf"plugins=\[{folder}\]: is not a folder with Python files, and holds none"):
         registry.discover([folder])
@@ -146,7 +146,7 @@ def test_a_command_warns_of_a_broken_plugin_and_runs(lp, walker, write):
 # ---------------------------------------------------------------- the command
 
 
-def test_the_listing_has_a_line_a_name_with_origin_settings_and_description(lp, walker, write):
+def test_the_listing_has_one_line_per_name(lp, walker, write):
     write("plugins/broken/tmp_broken.py", "import tmp_missing_package")
     finished = lp("plugins")
     assert finished.status == 0

@@ -1,4 +1,4 @@
-"""Absolute poses from relative ones: exact where they agree, and not led astray by those that are wrong."""
+"""Absolute poses from relative ones: exact if they agree, and robust to outliers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_relative_poses_that_agree_are_returned(views):
 
 @pytest.mark.parametrize(("views", "wrong"), [(4, 2), (5, 4), (6, 6), (7, 8), (8, 11)])
 def test_two_fifths_of_the_pairs_may_be_wrong(views, wrong):
-    """The poses are those of the pairs that are right; beyond two fifths it is the wrong ones' luck that decides."""
+    """The poses are those of the pairs that are right; beyond two fifths, the result depends on chance."""
     true, measured, weights = measured_sets(100, views, outliers=wrong)
     found = distance(fit_views(measured, weights), true).amax(dim=1) < 0.05
     assert found.double().mean() >= 0.9
@@ -148,14 +148,14 @@ def test_among_several_measurements_of_a_pair_the_rest_of_the_set_decides():
     assert found.double().mean() > 0.9
 
 
-def test_what_is_not_finite_counts_nothing():
+def test_non_finite_measurements_are_ignored():
     true, measured, weights = measured_sets(10, 5)
     measured[:, 0, 1] = torch.nan
     measured[:, 3, 2, 0, 0] = torch.inf
     assert distance(fit_views(measured, weights), true).max() < 1e-9
 
 
-def test_an_image_that_nothing_is_known_of_leaves_the_others_theirs():
+def test_an_image_without_measurements_does_not_affect_the_others():
     true, measured, weights = measured_sets(10, 5)
     measured[:, 2], measured[:, :, 2] = torch.nan, torch.nan
     poses = fit_views(measured, weights)

@@ -1,4 +1,4 @@
-"""Procedural objects are deterministic, well made and varied, and their ambiguity classes are true of their views."""
+"""Procedural objects are deterministic, valid and varied, and their ambiguity classes match their views."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def test_oval_is_symmetric_even_and_has_its_axes(exponent: float) -> None:
     assert ring[0, 2] == pytest.approx(-0.2) and ring[1, 0] < 0  # from the back over -X
 
 
-def test_body_carries_its_texture_by_height() -> None:
+def test_a_bodys_texture_is_mapped_by_height() -> None:
     shape = body([(0.4, 0.4, 0.0), (0.6, 0.6, 0.3), (0.2, 0.2, 1.0)])
     np.testing.assert_allclose(shape.uv[:, 1], shape.vertices[:, 1], atol=1e-12)
 
@@ -271,7 +271,7 @@ def test_sides_of_a_package_are_never_the_same_after_half_a_turn() -> None:
         assert not (np.array_equal(front, back) and np.array_equal(right, left))
 
 
-def test_ink_stands_out() -> None:
+def test_ink_contrasts_with_its_ground() -> None:
     random = np.random.default_rng(0)
     for ground in [(250, 250, 250), (10, 10, 10), (128, 128, 128), (200, 30, 30)]:
         assert all(contrast(ink(random, ground), ground) > 75 for _ in range(50))

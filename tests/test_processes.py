@@ -1,4 +1,4 @@
-"""`eval` and `train` on two processes, started by the real command: the numbers of one, sizes that do not divide."""
+"""`eval` and `train` on two processes give the numbers of one, also if sizes do not divide evenly."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def assert_the_same(ran: Ran, wanted: Ran) -> None:
 # ---------------------------------------------------------------- evaluation
 
 
-def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands, whole):
+def test_a_run_of_two_killed_processes_is_resumed_by_one(commands, whole):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     line = [sys.executable, "-m", "lp_framework", *commands.arguments("killed", "eval", *EVALUATION, *SPREAD)]
     process = subprocess.Popen(
@@ -97,7 +97,7 @@ def test_two_processes_that_were_killed_are_gone_on_with_by_one(commands, whole)
     assert_the_same(ran, whole)
 
 
-def test_an_evaluation_of_sets_that_one_process_began_is_gone_on_with_by_two(commands, monkeypatch):
+def test_an_evaluation_of_sets_started_by_one_process_is_resumed_by_two(commands, monkeypatch):
     settings = (*EVALUATION, "views=3", "solver=multiview", "solver.second_stage=false")
     whole = commands.here("sets_one", "eval", *settings)
     assert whole.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 2  # in batches of three sets, of which there are seven

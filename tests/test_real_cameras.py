@@ -135,7 +135,7 @@ def test_the_crop_is_the_turned_cameras_image_exactly(seed, distance, radius):
 
 @given(st.integers(0, 10**6), st.floats(1.2, 2.0))
 @settings(max_examples=30, deadline=None)
-def test_nothing_is_left_where_the_effective_radius_is_the_distance(seed, radius):
+def test_the_residual_is_zero_if_the_effective_radius_is_the_distance(seed, radius):
     camera, _ = real_camera(seed, distance=radius)
     radius = torch.tensor(radius, dtype=torch.float64)
     assert crop_field_of_view(radius, radius).item() == pytest.approx(math.radians(FIELD_OF_VIEW_DEGREES))

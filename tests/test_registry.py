@@ -68,7 +68,7 @@ def test_settings_come_from_the_config_and_components_from_the_caller(step):
         ({"gamma": 1}, {}, "the configuration of a solver has no name: choose one with solver=NAME"),
     ],
 )
-def test_what_does_not_fit_is_told_in_one_sentence(step, config, components, sentence):
+def test_a_mismatch_is_one_sentence(step, config, components, sentence):
     with pytest.raises(UserError) as error:
         build("solver", config, **components)
     assert sentence in str(error.value) and "\n" not in str(error.value)
@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_told_in_one_sentence(step, config, components, sen
         (dict[str, int], [{"a": 1}], []),
     ],
 )
-def test_values_fit_their_types_or_are_told(hint, fit, unfit):
+def test_values_of_wrong_types_are_reported(hint, fit, unfit):
     def init(self, value):
         self.value = value
 
@@ -105,7 +105,7 @@ def test_values_fit_their_types_or_are_told(hint, fit, unfit):
             build("start", {"name": "tmp_typed", "value": value})
 
 
-def test_an_unknown_group_is_told():
+def test_an_unknown_group_is_an_error():
     with pytest.raises(UserError, match="there is no group 'solvr'; did you mean 'solver'"):
         register("solvr", "x")
 

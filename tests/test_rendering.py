@@ -440,7 +440,7 @@ def test_an_interrupted_object_leaves_nothing_and_the_next_run_completes(tmp_pat
     render_objects([first, second], tmp_path, SMALL, FlatRenderer(fails_at=0), workers=1)  # nothing left to do
 
 
-def test_finished_objects_are_believed_without_their_meshes_where_that_is_asked_for(tmp_path, capfd):
+def test_finished_objects_can_be_reused_without_loading_their_meshes(tmp_path, capfd):
     first, second = objects_named("first", "second")
     render_objects([first], tmp_path, SMALL, FlatRenderer(), workers=1)
     unloadable = MeshObject("first", "unique", lambda: pytest.fail("the mesh was loaded"))
@@ -461,7 +461,7 @@ def test_finished_objects_are_believed_without_their_meshes_where_that_is_asked_
         lambda folder: (folder / "render.json").write_text("[]"),
     ],
 )
-def test_a_folder_without_its_record_is_not_believed(tmp_path, damage):
+def test_a_folder_without_a_record_is_not_reused(tmp_path, damage):
     render_objects(objects_named("cube"), tmp_path, SMALL, FlatRenderer(), workers=1)
     damage(tmp_path / "cube")
     with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no valid render\.json\)"):
@@ -493,7 +493,7 @@ def test_an_interrupt_by_the_user_leaves_no_half_object(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_killed_run_left_is_removed(tmp_path):
+def test_leftovers_of_a_killed_run_are_removed(tmp_path):
     leftover = tmp_path / ".cube.partial" / "train" / "rgb"
     leftover.mkdir(parents=True)
     (leftover / "777.png").write_bytes(b"half")
@@ -516,7 +516,7 @@ def test_another_protocol_or_mesh_is_not_mixed_in(tmp_path):
     render_object(obj, tmp_path, SMALL, FlatRenderer(fails_at=0))
 
 
-def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
+def test_an_unrelated_folder_is_unchanged(tmp_path):
     (tmp_path / "cube").mkdir()
     (tmp_path / "cube" / "thesis.txt").write_text("precious")
     with pytest.raises(UserError, match=r"the views in .* were rendered differently \(it has no valid render\.json\)"):
@@ -548,7 +548,7 @@ def test_records_are_as_they_were_before_later_settings_came(tmp_path):
     }  # fmt: skip
 
 
-def test_depths_are_kept_where_they_are_asked_for(tmp_path):
+def test_depths_are_saved_on_request(tmp_path):
     protocol = replace(SMALL, depth=True)
     with pytest.raises(UserError, match=r"renderer=flat does not provide depth; set data\.depth=false"):
         render_objects(objects_named("cube"), tmp_path / "flat", protocol, FlatRenderer(), workers=1)
@@ -626,7 +626,7 @@ def seen_colour(views: Path, name: str) -> list[bool]:
     return [bool(pixels[pixels[..., 3] == 255][:, channel].max() > 60) for channel in range(3)]
 
 
-def test_views_of_other_meshes_of_the_same_names_are_not_taken(coloured, tmp_path):
+def test_views_of_other_meshes_with_the_same_names_are_not_reused(coloured, tmp_path):
     views, red, blue = tmp_path / "views", coloured("red", (255, 0, 0)), coloured("blue", (0, 0, 255))
     views_of(red, views)
     assert [seen_colour(views, name) for name in ("ply", "obj")] == [[True, False, False]] * 2
@@ -641,7 +641,7 @@ def test_views_of_other_meshes_of_the_same_names_are_not_taken(coloured, tmp_pat
 
 
 @pytest.mark.parametrize(("file", "name"), [("ply.ply", "ply"), ("obj.obj", "obj"), ("paint.mtl", "obj")])
-def test_a_mended_mesh_or_material_is_noticed(coloured, tmp_path, file, name):
+def test_a_changed_mesh_or_material_is_detected(coloured, tmp_path, file, name):
     views, red, blue = tmp_path / "views", coloured("red", (255, 0, 0)), coloured("blue", (0, 0, 255))
     views_of(red, views)
     mended = blue / file
@@ -735,7 +735,7 @@ def test_processes_render_what_one_process_does_and_failures_are_listed_at_the_e
         assert contents(tmp_path / "one" / name) == contents(tmp_path / "two" / name)
 
 
-def test_the_command_says_what_is_wrong_in_a_line_each(lp, tmp_path):
+def test_the_command_prints_one_line_per_problem(lp, tmp_path):
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     trimesh.creation.box().export(meshes / "plain.stl")

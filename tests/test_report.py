@@ -1,4 +1,4 @@
-"""`report`: finding finished runs, grouping them by what varies, and what is written beside the paper's numbers."""
+"""`report`: finding runs, grouping them by varying settings, and writing them beside the paper's numbers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_run_without_hydras_folder_has_no_experiment(tmp_path):
         (None, "unfinished: no results.json"),
     ],
 )
-def test_an_unfinished_or_damaged_run_is_named_and_left_out(tmp_path, content, reason):
+def test_unfinished_and_damaged_runs_are_named_and_skipped(tmp_path, content, reason):
     write_result(tmp_path / "good")
     write_job(tmp_path / "bad")
     if content is not None:
@@ -86,7 +86,7 @@ def test_the_same_settings_and_seed_count_once(tmp_path):
     assert folder.name == "2" and reason == f"duplicate of {tmp_path / '1'} (same settings and seed)"
 
 
-def test_a_folder_that_is_not_there_is_an_error(tmp_path):
+def test_a_missing_folder_is_an_error(tmp_path):
     with pytest.raises(UserError, match=r"runs=.*nowhere: there is no such folder"):
         find_runs([tmp_path / "nowhere"])
 
@@ -133,7 +133,7 @@ def test_experiments_are_tables_of_their_own(tmp_path):
     assert tables[1].columns == ["solver.name", "solver.gamma", "start.count"]  # the paper's, though nothing varies
 
 
-def test_what_the_choice_of_a_solver_says_is_not_a_column():
+def test_settings_implied_by_the_solver_are_not_columns():
     ifusion = {"solver.name": "ifusion", "solver.steps": 100, "solver.factor": 0.6}
     two_stage = {"solver.name": "two_stage", "solver.gamma": 0, "solver.factor": 0.7}
     assert varying([ifusion, two_stage]) == ["solver.name"]
@@ -143,7 +143,7 @@ def test_what_the_choice_of_a_solver_says_is_not_a_column():
     assert varying([two_stage]) == []
 
 
-def test_settings_that_only_some_have_come_back_where_they_alone_tell_apart():
+def test_settings_of_some_rows_are_columns_if_only_they_distinguish_rows():
     old = {"solver.name": "two_stage"}
     assert varying([old, {**old, "solver.rescoring": 16}]) == ["solver.rescoring"]
 
@@ -277,7 +277,7 @@ def test_curves_of_one_label_share_a_colour_and_nothing_is_outside_the_axes():
 # ---------------------------------------------------------------- the command
 
 
-def test_the_command_writes_tables_and_figures_and_names_what_it_left_out(lp, tmp_path):
+def test_the_command_writes_tables_and_figures_and_names_skipped_runs(lp, tmp_path):
     gamma_sweep(tmp_path / "sweep")
     write_job(tmp_path / "sweep" / "stopped")
     ran = lp("report", "runs=sweep", "hydra.run.dir=out")
@@ -343,7 +343,7 @@ def test_a_mistake_is_one_sentence(lp, tmp_path, arguments, sentence):
     assert ran.status == 1 and ran.error.startswith(sentence)
 
 
-def test_what_changes_no_result_is_no_setting(lp, tmp_path):
+def test_settings_that_do_not_affect_results_are_ignored(lp, tmp_path):
     for seed, batch_pairs in ((0, None), (1, 20)):
         write_result(tmp_path / "runs" / str(seed), {"seed": seed, "batch_pairs": batch_pairs, "resume": None})
     assert lp("report", "runs=runs", "hydra.run.dir=report").status == 0

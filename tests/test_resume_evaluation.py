@@ -1,4 +1,4 @@
-"""An `eval` that was stopped at any moment goes on, and its results are those of one that was not."""
+"""An `eval` interrupted at any moment can be resumed, with the results of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def commands(tmp_path_factory) -> Commands:
 
 @pytest.fixture(scope="module")
 def whole(commands) -> Ran:
-    """An evaluation that nothing stops."""
+    """An uninterrupted evaluation."""
     ran = commands.here("whole", "eval", *EVALUATION)
     assert ran.status == 0, ran.err
     return ran
@@ -90,7 +90,7 @@ def went_on(ran: Ran) -> int:
 # ---------------------------------------------------------------- stopped and gone on
 
 
-def test_an_evaluation_after_kill_9_goes_on_and_gives_the_numbers_of_an_uninterrupted_one(commands, whole):
+def test_resuming_after_kill_9_gives_the_numbers_of_an_uninterrupted_run(commands, whole):
     process = commands.start("killed", "eval", *EVALUATION)
     lines = journal(commands.folder / "killed")
     deadline = time.monotonic() + 100
@@ -111,7 +111,7 @@ def test_an_evaluation_after_kill_9_goes_on_and_gives_the_numbers_of_an_uninterr
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.77, 0.999])
-def test_a_journal_cut_anywhere_loses_the_batch_that_it_cuts(commands, whole, stop, share):
+def test_a_truncated_journal_loses_only_the_truncated_batch(commands, whole, stop, share):
     lines = journal(stop(f"cut{share}", 5))
     content = lines.read_bytes()
     kept = content[: int(share * len(content))]
@@ -141,7 +141,7 @@ def test_damaged_lines_are_solved_again(commands, whole, stop, damage):
     assert_the_same(ran, whole)
 
 
-def test_a_run_may_be_stopped_again_and_again(commands, whole, stop):
+def test_a_run_may_be_interrupted_repeatedly(commands, whole, stop):
     for solved in (2, 1, 0, 3):
         with journal(stop("again", solved)).open("ab") as lines:
             lines.write(b'01234567 {"pair":[')  # what a kill leaves of a line
@@ -164,7 +164,7 @@ def test_a_run_stopped_before_its_tables_were_written_writes_them(commands, whol
 
 
 @pytest.mark.parametrize("place", ["journal", "tables", "pictures"])
-def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, monkeypatch, place):
+def test_an_evaluation_resumes_after_a_full_disk(commands, whole, monkeypatch, place):
     def full(*arguments: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -197,7 +197,7 @@ def test_an_evaluation_goes_on_when_a_full_disk_has_room_again(commands, whole, 
     assert not (commands.folder / "unused").exists()
 
 
-def test_a_command_that_a_scheduler_ends_says_how_it_goes_on(commands, whole, monkeypatch):
+def test_a_terminated_command_says_how_to_resume(commands, whole, monkeypatch):
     solve = Evaluation.test_step
 
     def ended(self: Evaluation, batch, batch_idx: int) -> None:
@@ -216,7 +216,7 @@ def test_a_command_that_a_scheduler_ends_says_how_it_goes_on(commands, whole, mo
     assert_the_same(ran, whole)
 
 
-def test_sets_of_views_go_on(commands, stop):
+def test_evaluations_of_view_sets_resume(commands, stop):
     settings = ("views=3", "solver.gamma=0.1")
     wanted = commands.here("sets", "eval", *EVALUATION, *settings)
     assert len(wanted.json()["per_object"]) == len(OBJECTS)
@@ -226,7 +226,7 @@ def test_sets_of_views_go_on(commands, stop):
     assert_the_same(ran, wanted)
 
 
-def test_a_job_of_a_sweep_goes_on(commands, whole, stop):
+def test_a_job_of_a_sweep_resumes(commands, whole, stop):
     stop("sweep/0", 4)
     sweep = commands.here("unused", "eval", "--multirun", *EVALUATION, "hydra.sweep.dir=sweep", "seed=0,1")
     assert went_on(sweep) == 4 * BATCH
@@ -235,14 +235,14 @@ def test_a_job_of_a_sweep_goes_on(commands, whole, stop):
     assert (commands.folder / "sweep" / "1" / "results.json").is_file()
 
 
-def test_a_finished_run_is_made_anew(commands, whole):
+def test_a_finished_run_is_repeated(commands, whole):
     shutil.copytree(whole.folder, commands.folder / "finished")
     ran = commands.here("finished", "eval", *EVALUATION)
     assert "going on" not in ran.out
     assert_the_same(ran, whole)
 
 
-def test_results_do_not_outlive_the_beginning_of_others(commands, whole, stop):
+def test_starting_another_evaluation_removes_old_results(commands, whole, stop):
     shutil.copytree(whole.folder, commands.folder / "others")
     folder = stop("others", 1, "seed=1")
     assert not (folder / "results.json").exists()
@@ -252,7 +252,7 @@ def test_results_do_not_outlive_the_beginning_of_others(commands, whole, stop):
 # ---------------------------------------------------------------- what does not go together
 
 
-def test_another_configuration_is_refused_in_a_sentence_and_nothing_is_lost(commands, stop):
+def test_another_configuration_is_refused_and_nothing_is_lost(commands, stop):
     folder = stop("mixed", 2)
     before = journal(folder).read_bytes()
     expected = "mixed: contains another unfinished evaluation ({}); choose another folder or remove mixed/unfinished"
@@ -267,7 +267,7 @@ def test_another_configuration_is_refused_in_a_sentence_and_nothing_is_lost(comm
     assert went_on(moved) == 2 * BATCH
 
 
-def test_a_model_that_was_trained_anew_is_refused(commands, stop):
+def test_a_retrained_model_is_refused(commands, stop):
     checkpoint = commands.folder / "score" / "checkpoints" / "best.ckpt"
     kept = checkpoint.read_bytes()
     stop("retrained", 1)
@@ -297,7 +297,7 @@ def test_views_that_have_changed_are_refused(commands, stop):
         transforms.write_text(kept)
 
 
-def test_an_evaluation_that_has_solved_nothing_is_in_nobodys_way(commands, stop):
+def test_an_unfinished_evaluation_without_results_is_replaced(commands, stop):
     stop("empty", 0)
     ran = commands.here("empty", "eval", *EVALUATION, "seed=1")
     assert ran.status == 0, ran.err
@@ -318,7 +318,7 @@ def test_what_cannot_be_resumed_is_named(commands, whole, stop):
     assert commands.here("unused", "eval", "resume=kept", "trainer.devices=1").status == 0
 
 
-def test_a_resumed_run_keeps_its_model_though_a_later_one_is_there(commands, stop, monkeypatch):
+def test_a_resumed_run_keeps_its_model_despite_a_later_one(commands, stop, monkeypatch):
     shutil.copytree(commands.folder / "score", commands.folder / "runs" / "train" / "early")
     stop("default", 1, "checkpoint=latest")
     later = shutil.copytree(commands.folder / "score", commands.folder / "runs" / "train" / "later")
@@ -364,7 +364,7 @@ def test_a_journal_gives_back_every_bit(tmp_path):
         Journal(tmp_path, other).begin("views")
 
 
-def test_results_say_what_they_were_made_from(commands, whole):
+def test_results_record_their_inputs(commands, whole):
     results = whole.json()
     assert results["fingerprints"].keys() == {"weights", "views"}
     training = json.loads((commands.folder / "score" / "training.json").read_text())

@@ -1,4 +1,4 @@
-"""The folder of a run: one command at a time, full disks, nothing left behind empty."""
+"""Run folders: one command at a time, full disks, no empty folders."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lp_framework.run_folders import Held, held, remove_if_empty
 SENTENCE = "is in use by another command; wait for it, or choose another folder"
 
 
-def test_a_folder_is_one_commands_at_a_time(tmp_path: Path):
+def test_only_one_command_at_a_time_uses_a_folder(tmp_path: Path):
     with held(tmp_path), pytest.raises(Held, match=f"{tmp_path}: {SENTENCE}"), held(tmp_path):
         pass
     with pytest.raises(ZeroDivisionError), held(tmp_path):
@@ -25,7 +25,7 @@ def test_a_folder_is_one_commands_at_a_time(tmp_path: Path):
         assert not (tmp_path / "nowhere").exists()
 
 
-def test_death_frees_a_folder(tmp_path: Path):
+def test_a_killed_process_releases_its_folder(tmp_path: Path):
     process = os.fork()
     if process == 0:
         with held(tmp_path):
@@ -43,7 +43,7 @@ def test_death_frees_a_folder(tmp_path: Path):
 
 
 @pytest.mark.parametrize("file", [None, "events.out"])
-def test_a_full_disk_is_told_with_the_file_where_the_system_knows_it(file: str | None, tmp_path: Path):
+def test_a_full_disk_is_reported_with_the_file_if_known(file: str | None, tmp_path: Path):
     error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *([] if file is None else [str(tmp_path / file)]))
     room = r"No space left on device: it needs more than the [\d.]+ MB that are free"
     expected = rf"{tmp_path / (file or '')}: cannot be written \({room}\)"

@@ -1,4 +1,4 @@
-"""What a training leaves for others: loggers, a folder of weights with a model card, the Hugging Face hub."""
+"""Sharing a trained model: loggers, a folder of weights with a model card, the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_card_without_an_evaluation_says_so_and_a_damaged_one_is_named(trained
         model_card(trained / "energy", "name", None, str(tmp_path))
 
 
-def test_an_unfinished_run_is_converted_without_a_card_unless_one_is_asked_for(
+def test_an_unfinished_run_is_converted_without_a_card_unless_requested(
     trained: Path, lp: Any, tmp_path: Path, walker: Path
 ) -> None:
     shutil.copytree(trained / "score", tmp_path / "stopped")

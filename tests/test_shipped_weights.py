@@ -1,4 +1,4 @@
-"""What ships works out of the box: the tiny prior and the score model, on unseen views of the embedded objects."""
+"""The bundled prior and score model work out of the box, on unseen views of the embedded objects."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ def test_the_weights_are_small_and_say_where_they_come_from():
         assert {"config.yaml", "metrics.csv", "training.png"} <= {file.name for file in (SHIPPED / name).iterdir()}
 
 
-def test_the_least_energy_is_at_the_true_azimuth(landscape):
+def test_the_lowest_energy_is_at_the_true_azimuth(landscape):
     assert landscape["within_unique_answer"] >= 0.85
 
 
-def test_objects_of_two_faces_have_a_second_valley_half_a_turn_away(landscape):
+def test_twofold_objects_have_a_second_minimum_half_a_turn_away(landscape):
     twofold = [row for row in landscape["objects"] if row["ambiguity"] == "twofold"]
     assert len(twofold) == 3
     for row in twofold:
@@ -68,7 +68,7 @@ def test_objects_of_two_faces_have_a_second_valley_half_a_turn_away(landscape):
         assert abs(first["degrees"]) <= 15 and 180 - abs(second["degrees"]) <= 15, row["object"]
 
 
-def test_the_relief_tells_objects_without_an_answer(landscape):
+def test_the_relief_identifies_objects_without_a_unique_answer(landscape):
     relief = {answer: [row["relief"] for row in landscape["objects"] if row["unique_answer"] == answer]
               for answer in (True, False)}  # fmt: skip
     assert max(relief[False]) < 0.2 * min(relief[True])

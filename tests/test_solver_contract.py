@@ -1,4 +1,4 @@
-"""Every registered solver keeps the contract of the interface; nobody is skipped."""
+"""Every registered solver satisfies the contract of the interface."""
 
 from __future__ import annotations
 

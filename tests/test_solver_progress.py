@@ -1,4 +1,4 @@
-"""Bars of a solver's steps: on a terminal, inside `shown_progress`, and nowhere else."""
+"""Progress bars of solver steps: only on a terminal and inside `shown_progress`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Starts: where they lie, and what they depend on."""
+"""Starts: their positions and dependencies."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ SWEEP = ("--multirun", "hydra.sweep.dir=sweep", "checkpoint=./score", "solver.it
 
 @pytest.fixture
 def jobs(monkeypatch):
-    """What `eval` was run with: config, folder, command line and mode of every job."""
+    """Config, folder, command line and mode of every job of `eval`."""
     import lp_framework.commands.eval as command
 
     jobs = []
@@ -93,7 +93,7 @@ def test_an_experiment_is_one_run_where_asked(lp, jobs, tmp_path):
     assert config.solver.name == "two_stage" and folder == str(tmp_path / "one")
 
 
-def test_what_a_job_starts_again_is_the_job_and_not_the_sweep(lp, jobs, monkeypatch):
+def test_a_job_restarts_itself_and_not_the_sweep(lp, jobs, monkeypatch):
     assert lp("eval", "experiment=gamma", "seed=0").status == 0
     again = jobs[2][2]
     assert "hydra.mode=RUN" in again and "solver.gamma=0.3" in again
@@ -128,7 +128,7 @@ def result(folder: Path) -> dict:
     return json.loads((folder / "results.json").read_text())
 
 
-def test_a_sweep_goes_on_with_the_jobs_that_have_no_result(sweep):
+def test_a_sweep_resumes_with_the_unfinished_jobs(sweep):
     assert sweep("seed=0,1,2").status == 0
     whole = {number: result(sweep.folder / number) for number in "012"}
     when = {number: (sweep.folder / number / "results.json").stat().st_mtime_ns for number in "02"}
@@ -154,14 +154,14 @@ def test_a_sweep_that_is_started_twice_is_shared(sweep):
     assert again.out.count("skipped (already finished): ") == 2 and (sweep.folder / "1" / "results.json").is_file()
 
 
-def test_the_views_of_finished_jobs_are_looked_at_once(sweep, monkeypatch):
+def test_the_views_of_finished_jobs_are_checked_once(sweep, monkeypatch):
     assert sweep("seed=0,1,2").status == 0
     fingerprint, looked = PairDataModule.fingerprint, []
     monkeypatch.setattr(PairDataModule, "fingerprint", lambda *of: looked.append(of) or fingerprint(*of))
     assert sweep("seed=0,1,2").out.count("skipped (already finished): ") == 3 and len(looked) == 1
 
 
-def test_results_of_another_configuration_are_kept_and_said_and_the_others_run(sweep):
+def test_results_of_another_configuration_are_kept_and_reported(sweep):
     assert sweep("solver.gamma=0,0.1").status == 0
     before = (sweep.folder / "1" / "results.json").read_bytes()
     again = sweep("solver.gamma=0,0.3,0.5")
@@ -195,7 +195,7 @@ def test_a_model_that_was_trained_again_is_another_model(sweep, commands):
     assert "skipped" in sweep("seed=0").out
 
 
-def test_results_of_other_views_are_not_taken(sweep, commands):
+def test_results_of_other_views_are_not_reused(sweep, commands):
     assert sweep("seed=0").status == 0
     image = commands.folder / "views" / "cup" / "test" / "rgb" / "000.png"
     kept = image.read_bytes()
@@ -207,13 +207,13 @@ def test_results_of_other_views_are_not_taken(sweep, commands):
     assert "skipped" in sweep("seed=0").out
 
 
-def test_a_single_run_is_made_anew(commands):
+def test_a_single_run_is_repeated(commands):
     for _ in range(2):
         ran = commands.here("single", "eval", "checkpoint=./score", "solver.iterations=2")
         assert ran.status == 0 and "skipped" not in ran.out
 
 
-def test_an_experiment_goes_on_in_its_own_folder(commands):
+def test_an_experiment_resumes_in_its_own_folder(commands):
     first = ("experiment=gamma", "solver=langevin", "checkpoint=./score", "seed=0", "solver.gamma=0,0.3")
     assert commands.here("unused", "eval", *first).status == 0
     more = commands.here("unused", "eval", *first[:-2], "seed=0,1", "solver.gamma=0,0.3")
@@ -264,7 +264,7 @@ def test_jobs_in_other_processes_know_plugins_and_configs_and_are_not_done_twice
     assert again.status == 0 and again.out.count("skipped (already finished): ") == 2
 
 
-def test_what_is_asked_of_slurm(tmp_path, monkeypatch):
+def test_slurm_settings(tmp_path, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="the launchers are in the extra sweeps")
     from submitit.slurm.slurm import SlurmExecutor
 

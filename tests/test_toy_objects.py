@@ -141,12 +141,12 @@ CONTENT = {
 
 
 @pytest.mark.parametrize("name", TOYS)
-def test_what_ships_is_what_the_recorded_numbers_were_measured_on(name: str) -> None:
+def test_bundled_objects_are_those_of_the_recorded_results(name: str) -> None:
     assert content(scene_of(name)) == CONTENT[name]
 
 
 @pytest.mark.parametrize("name", TOYS)
-def test_what_ships_is_what_its_maker_makes(name: str) -> None:
+def test_bundled_objects_are_reproducible_by_their_script(name: str) -> None:
     assert list(MAKERS) == list(TOYS)
     for made, ships in zip(MAKERS[name]().geometry.values(), scene_of(name).geometry.values(), strict=True):
         np.testing.assert_allclose(made.vertices, ships.vertices, rtol=0, atol=1e-12)  # the last bits are the machine's
@@ -164,7 +164,7 @@ def test_unique_shape_differs_after_every_turn(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", names("twofold"))
-def test_twofold_shape_returns_after_half_a_turn_only(name: str) -> None:
+def test_twofold_shape_repeats_only_after_half_a_turn(name: str) -> None:
     points, _ = cloud(name)
     assert chamfer(points, turned(points, 180)) < SAME
     assert min(chamfer(points, turned(points, degrees)) for degrees in range(30, 151, 30)) > DIFFERENT
@@ -178,13 +178,13 @@ def test_twofold_vertices_map_onto_each_other(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", names("twofold"))
-def test_twofold_paint_tells_front_from_back(name: str) -> None:
+def test_twofold_paint_distinguishes_front_and_back(name: str) -> None:
     assert colour_difference(name, 180) > 0.1
 
 
 @pytest.mark.parametrize("name", names("continuous"))
 @pytest.mark.parametrize("degrees", [7.3, 61.0, 133.7])
-def test_continuous_shape_returns_after_any_turn(name: str, degrees: float) -> None:
+def test_continuous_shape_is_unchanged_by_any_turn(name: str, degrees: float) -> None:
     points, _ = cloud(name)
     assert chamfer(points, turned(points, degrees)) < SAME
 

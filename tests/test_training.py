@@ -1,4 +1,4 @@
-"""`train` from the command line: what a run leaves, resuming after kill -9, two processes, stopping early, errors."""
+"""`train` from the command line: output files, resuming after kill -9, two processes, early stopping, errors."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_resuming_after_kill_9_gives_the_weights_of_an_uninterrupted_run(command
     assert_equal(killed.checkpoint("best.ckpt")["state_dict"], whole.checkpoint("best.ckpt")["state_dict"])
 
 
-def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
+def test_a_resumed_run_keeps_its_metrics_and_settings(commands):
     commands.here("prolonged", "train", "trainer.max_epochs=2")
     first = rows(commands.folder / "prolonged")
     ran = commands.here("onwards", "train", "resume=prolonged", "trainer.max_epochs=3")
@@ -207,7 +207,7 @@ def test_a_run_that_goes_on_keeps_its_metrics_and_settings(commands):
     assert (commands.folder / "prolonged" / "training.json").is_file()
 
 
-def test_ctrl_c_says_how_to_go_on(commands, monkeypatch):
+def test_ctrl_c_says_how_to_resume(commands, monkeypatch):
     begin = ScoreModel.on_train_epoch_start
 
     def interrupted(self: ScoreModel) -> None:
@@ -225,7 +225,7 @@ def test_ctrl_c_says_how_to_go_on(commands, monkeypatch):
 
 
 @pytest.mark.parametrize("written_by", ["this version", "an earlier one"])
-def test_the_best_epoch_of_a_run_that_was_moved_stays_the_best(commands, score, written_by):
+def test_the_best_epoch_of_a_moved_run_stays_the_best(commands, score, written_by):
     moved = commands.folder / f"moved by {written_by}"
     shutil.copytree(score.folder, moved)
     best, last = moved / "checkpoints" / "best.ckpt", moved / "checkpoints" / "last.ckpt"
@@ -248,7 +248,7 @@ def test_the_best_epoch_of_a_run_that_was_moved_stays_the_best(commands, score, 
     assert after["epoch"] == 3 and after["callbacks"][key]["best_model_score"] == unbeatable
 
 
-def test_a_run_that_goes_on_does_so_in_its_own_folder_alone(commands, score):
+def test_a_resumed_run_writes_only_to_its_own_folder(commands, score):
     folder = shutil.copytree(score.folder, commands.folder / "logged")
     hydra = (folder / ".hydra" / "overrides.yaml").read_text()
     log = (folder / "train.log").read_text()
@@ -258,7 +258,7 @@ def test_a_run_that_goes_on_does_so_in_its_own_folder_alone(commands, score):
     assert not (commands.folder / "unused").exists()
 
 
-def test_a_second_training_in_a_folder_is_told_so_and_touches_nothing(commands, score):
+def test_a_second_training_in_a_folder_is_refused_and_changes_nothing(commands, score):
     folder = shutil.copytree(score.folder, commands.folder / "held")
     weights = (folder / "checkpoints" / "last.ckpt").read_bytes()
     with held(folder):
@@ -269,7 +269,7 @@ def test_a_second_training_in_a_folder_is_told_so_and_touches_nothing(commands, 
     assert commands.here("unused", "train", "resume=held", "trainer.max_epochs=4").status == 0
 
 
-def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_on(commands, score, monkeypatch):
+def test_a_full_disk_leaves_complete_checkpoints_to_resume_from(commands, score, monkeypatch):
     write, room = Path.write_bytes, [3]
 
     def write_while_there_is_room(path: Path, content: bytes) -> int:
@@ -300,7 +300,7 @@ def test_a_disk_that_fills_up_leaves_whole_checkpoints_from_which_the_run_goes_o
     assert losses[0] == losses[1]
 
 
-def test_metrics_are_whole_where_the_disk_fills_up(tmp_path, monkeypatch):
+def test_metrics_are_complete_after_a_full_disk(tmp_path, monkeypatch):
     logger, write = MetricsLogger(tmp_path), Path.write_text
     logger.log_metrics({"train/loss": 1.0}, step=0)
     logger.save()
@@ -320,7 +320,7 @@ def test_metrics_are_whole_where_the_disk_fills_up(tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == ["metrics.csv"]
 
 
-def test_the_same_command_goes_on_in_its_folder_and_another_does_not_write_over_it(commands, score):
+def test_the_same_command_resumes_and_another_one_does_not_overwrite(commands, score):
     weights = score.checkpoint()["state_dict"]
     assert commands.here("score", "train").error.startswith("score: all epochs are done")
     assert commands.here("score", "train", "model=energy").error.startswith(
@@ -334,7 +334,7 @@ def test_the_same_command_goes_on_in_its_folder_and_another_does_not_write_over_
     assert_equal(score.checkpoint()["state_dict"], weights)
 
 
-def test_a_training_that_diverges_is_an_error_and_its_model_is_not_taken(commands, monkeypatch):
+def test_a_diverged_training_is_an_error_and_its_model_is_not_used(commands, monkeypatch):
     ran = commands.here("runs/train/far", "train", "model.learning_rate=1e30", "trainer.max_epochs=1")
     assert ran.status == 1 and re.search(r"error: .*far: training diverged \(not finite: .*loss.*\)", ran.err)
     monkeypatch.chdir(commands.folder)
@@ -364,7 +364,7 @@ def test_a_damaged_configuration_is_named(commands, score, content):
     assert commands.here(folder.name, "train").error.startswith(sentence)
 
 
-def test_resuming_what_is_not_there_is_named(commands):
+def test_resuming_a_missing_run_is_an_error(commands):
     for folder, said in (
         ("nowhere", "there is no such file or folder"),
         ("views", "contains no checkpoints/last.ckpt to resume from"),
@@ -437,7 +437,7 @@ def test_a_checkpoint_of_the_hub_is_fetched_by_its_id(monkeypatch, tmp_path):
     assert find_checkpoint("runs/nothing") == Path("runs/nothing")  # a path whose folder is here asks nobody
 
 
-def test_reading_a_checkpoint_runs_no_code_of_it(score):
+def test_reading_a_checkpoint_executes_no_code(score):
     assert read_checkpoint(score.folder / "checkpoints" / "last.ckpt")["epoch"] == 2
     with pytest.raises(ValueError, match="there is no backbone 'tmp_tiny'"):
         load_model(score.folder)  # the plugin is not loaded here

@@ -1,4 +1,4 @@
-"""Two stages: the first finds the valley, the second its bottom; the hand-over, the joined path, the failures."""
+"""Two stages: the first finds the basin, the second its minimum; their joined trajectory and failures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class FailsHigh(ExactModel):
         return FieldValue((condition - pose).masked_fill(pose[..., :1] > 5, torch.nan), None)
 
 
-def test_the_first_stage_leaves_the_wrong_valley_and_the_second_finds_the_bottom():
+def test_the_first_stage_leaves_the_wrong_basin_and_the_second_finds_the_minimum():
     pairs, true = exact_pairs(8)
     starts = around(true, -0.7, 0.5, math.pi - 0.7, math.pi)
     prior = ExactPrior(*WRONG_VALLEY)
@@ -50,7 +50,7 @@ def test_the_first_stage_leaves_the_wrong_valley_and_the_second_finds_the_bottom
     assert both.valid.all()
 
 
-def test_a_first_stage_with_the_papers_noise_mostly_ends_in_the_right_valley():
+def test_a_first_stage_with_the_papers_noise_mostly_ends_in_the_right_basin():
     pairs, true = exact_pairs(40)
     starts = around(true, 0.0, math.pi / 2, math.pi, -math.pi / 2)
     solution = TwoStage(ExactModel(), ExactPrior(*WRONG_VALLEY)).solve(pairs, starts, seed=0)
@@ -73,7 +73,7 @@ def test_without_refinement_it_is_the_first_stage():
 
 
 @pytest.mark.parametrize("true_radius", [-0.5, 0.0, 0.5])
-def test_it_goes_on_from_any_radius(true_radius):
+def test_the_second_stage_starts_from_any_radius(true_radius):
     """The first stage ends far beyond what a relative radius can be; the second still has a slope there."""
     pairs, true = exact_pairs(4)
     images = pairs.images.clone()

@@ -1,4 +1,4 @@
-"""Sets of several images: which there are, how batches carry them, and `eval views=...`."""
+"""Sets of several images: their enumeration, their batches, and `eval views=...`."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_batch_holds_whole_sets(data):
     assert sum(len(batch) for batch in data.test_dataloader()) == 2 * TEST_VIEWS * (TEST_VIEWS - 1)
 
 
-def test_a_solver_is_asked_for_sets_and_its_answers_come_back_image_by_image(data):
+def test_a_solver_gets_sets_and_its_answers_are_returned_per_image(data):
     data.evaluate_on("ordered", views=3)
     data.prepare_data()
     (batch,) = data.test_dataloader()

@@ -145,12 +145,12 @@ def test_each_view_may_have_its_own_field_of_view(path):
         ({"camera_angle_x": None}, "needs camera_angle_x"),
     ],
 )
-def test_intrinsics_of_a_frame_that_are_none(path, intrinsics, message):
+def test_invalid_intrinsics_of_a_frame(path, intrinsics, message):
     rewrite_frame(path, 1, **intrinsics)
     assert re.search(message, sentence(path))
 
 
-def test_small_deviations_from_spherical_cameras_are_kept_not_mended(path):
+def test_small_deviations_from_spherical_cameras_are_kept(path):
     camera = read(path).cameras[1].clone()
     tilt = torch.tensor([0.0, 0.0, math.radians(0.5 * LARGEST_RESIDUAL)], dtype=torch.float64)
     camera[:3, :3] = camera[:3, :3] @ so3_exp(tilt)
@@ -185,7 +185,7 @@ def test_a_missing_file(path):
 @pytest.mark.parametrize(
     "text", ["", "{", '{"frames": [', "[1, 2", "\x00", "[" * 100_000, b"\xff\xfe\xfa"], ids=lambda t: repr(t)[:9]
 )
-def test_what_is_no_json(path, text):
+def test_files_that_are_not_json(path, text):
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     assert "is not readable JSON" in sentence(path)
 
@@ -208,7 +208,7 @@ def test_missing_keys_of_a_frame(path, key):
 
 
 @pytest.mark.parametrize("angle", [0, -0.8, math.pi, 49.1, math.nan, math.inf])
-def test_fields_of_view_that_are_none(path, angle):
+def test_invalid_fields_of_view(path, angle):
     rewrite(path, camera_angle_x=angle)
     assert "camera_angle_x must be an angle in radians between 0 and pi" in sentence(path)
 
@@ -238,7 +238,7 @@ def test_missing_images(path, name):
     assert "is neither in rgb/ nor beside this file" in sentence(path)
 
 
-def test_an_image_that_has_gone(path):
+def test_a_deleted_image(path):
     (path.parent / "rgb" / "001.png").unlink()
     assert "the image '001.png'" in sentence(path)
 
@@ -270,7 +270,7 @@ def at(x: float, y: float, z: float) -> list[list[float]]:
     ],
     ids=lambda matrix: repr(matrix)[:20],
 )  # fmt: skip
-def test_what_is_no_matrix(path, matrix):
+def test_invalid_matrices(path, matrix):
     rewrite_frame(path, 1, transform_matrix=matrix)
     assert "transform_matrix of frame 1 is not a 4 x 4 matrix of finite numbers" in sentence(path)
 
@@ -286,7 +286,7 @@ MIRRORED = GOOD @ torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.flo
     ],
     ids=["scaled", "skewed", "mirrored", "zero", "half", "projective", "transposed", "overflowing"],
 )  # fmt: skip
-def test_what_is_not_rigid(path, matrix):
+def test_matrices_that_are_not_rigid(path, matrix):
     rewrite_frame(path, 1, transform_matrix=matrix)
     assert "the camera of frame 1 is not a rigid camera-to-world transform" in sentence(path)
 
@@ -345,13 +345,13 @@ def lasting_path(tmp_path_factory) -> Path:
 @given(content=anything)
 @example(content={"camera_angle_x": 1, "frames": {"file_path": 1}})
 @example(content={"camera_angle_x": 10**400, "frames": []})
-def test_any_json_is_refused_or_sound(lasting_path, content):
+def test_any_json_is_refused_or_valid(lasting_path, content):
     check_refused_or_sound(lasting_path, content)
 
 
 @settings(deadline=None, max_examples=250, derandomize=True)
 @given(data=st.data(), value=anything)
-def test_any_part_replaced_by_anything_is_refused_or_sound(lasting_path, data, value):
+def test_any_replaced_part_is_refused_or_valid(lasting_path, data, value):
     content = transforms(random_poses(2, "cup", "train"), ambiguity="unique", unique_answer=True)
     part: object = content
     while True:

@@ -1,4 +1,4 @@
-"""`views`: every view is drawn at its pose, named by its angles, and the same from the same seed."""
+"""`views`: every view is generated at its pose, named by its angles, and reproducible."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def test_an_image_on_white_is_taken_whole(draw, tmp_path):
     assert brightness[0].item() == pytest.approx((source / 127.5 - 1).mean(), abs=0.01)
 
 
-def test_a_mask_says_what_the_object_is(draw, tmp_path, write):
+def test_a_mask_selects_the_object(draw, tmp_path, write):
     disc(mode="RGB").save(tmp_path / "disc.png")
     (tmp_path / "masks").mkdir()
     disc().getchannel("A").save(tmp_path / "masks" / "disc.png")
@@ -238,7 +238,7 @@ def test_the_prior_says_which_sampling_there_is(lp, tmp_path, setting, sentence)
     assert lp("views", "image=disc.png", "longitudes=1", setting).error.startswith(sentence)
 
 
-def test_an_image_without_background_is_told_what_to_do(draw, lp, tmp_path):
+def test_an_image_without_background_says_what_to_do(draw, lp, tmp_path):
     disc(mode="RGB").save(tmp_path / "disc.png")
     assert "or crop=false if it shows the object on white" in mistake(draw, lp, "image=disc.png")
     assert "must be square" in mistake(draw, lp, "image=disc.png", "crop=false")

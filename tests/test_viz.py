@@ -1,4 +1,4 @@
-"""Pictures: what is drawn is right, at the level of arrays; files are whole."""
+"""Figures: the drawn arrays are correct, and files are complete."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_path_on_the_map_is_the_path_on_the_circle(start: float, steps: list[tup
         assert drawn_latitude[gap - 1] == drawn_latitude[gap + 1]
 
 
-def test_path_that_stays_on_the_map_is_left_alone():
+def test_a_path_that_stays_on_the_map_is_unchanged():
     latitude, longitude = broken_at_seam(np.array([1.0, 2.0, 3.0]), np.array([350.0, 340.0, 355.0]))
     assert latitude.tolist() == [1, 2, 3] and longitude.tolist() == [350, 340, 355]
 
@@ -367,7 +367,7 @@ def test_figures_are_saved_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert sorted(tmp_path.glob("new/.*")) == [] and [file.read_bytes() for file in files] == before
 
 
-def test_callers_settings_are_left_alone_and_have_no_say():
+def test_the_callers_settings_are_unchanged_and_ignored():
     with matplotlib.rc_context({"axes.facecolor": "black", "font.size": 30}):
         before = dict(matplotlib.rcParams)
         figure = training_figure({"train/loss": Curve(np.arange(3.0), np.ones(3))}, None)
@@ -481,7 +481,7 @@ def test_pictures_of_an_evaluation(data: PairData, tmp_path: Path):
     assert len(kept) == len(names) - 2 and all(each.trajectories is not None for each in kept)
 
 
-def test_the_calibration_of_an_evaluation_that_tells_probabilities(data: PairData, tmp_path: Path):
+def test_the_calibration_of_an_evaluation_with_probabilities(data: PairData, tmp_path: Path):
     evaluation = evaluated(Langevin(ScoreModel(Means(), hidden=8, layers=1), iterations=5), data, Ring(4))
     bins = [{"pairs": 3, "probability": 0.2, "right": 0.3}, {"pairs": 9, "probability": 0.9, "right": 0.8}]
     result = {**evaluation.metrics.compute(), "breakdown": {"calibration": {"bins": bins}}}

@@ -1,4 +1,4 @@
-"""The picture of the cameras: where things are drawn, at the level of points and arrays."""
+"""The figure of the cameras: positions of what is drawn, as points and arrays."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_verdicts_are_written_and_colour_their_cameras():
     assert colours["trust"] == cameras.TRUSTED["trust"] != colours["do not trust"] == cameras.TRUSTED["do not trust"]
 
 
-def test_an_image_seen_edge_on_is_left_out(monkeypatch: pytest.MonkeyPatch):
+def test_an_image_seen_edge_on_is_not_drawn(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cameras, "best_viewpoint", lambda poses: viewpoint(0.0, math.pi / 2))
     poses = np.array([[0.0, 0.0, 1.4], [0.0, 1.0, 1.4]])
     figure = figure_of(poses)

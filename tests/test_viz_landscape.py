@@ -1,4 +1,4 @@
-"""Pictures of landscapes: what stands where, what is left out, and how they look."""
+"""Figures of landscapes: positions, omissions and appearance."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PATHS = np.stack(
 
 
 def solved_pair(paths: NDArray, chosen: int | None = None, landscape: Landscape = LANDSCAPE) -> ShownPair:
-    """A pair in which a solver took the paths `[N, S, 3]`, each ending a degree further off."""
+    """A pair in which a solver took the paths `[N, S, 3]`, each ending one degree further off."""
     view, numbers = View(Path("000.png"), IMAGE, TRUTH), np.arange(len(paths), dtype=float)
     return ShownPair(
         "duck", "unique", "", view, view, TRUTH, paths[:, 0], paths, paths[:, -1], 0 * numbers, chosen, numbers,
@@ -99,7 +99,7 @@ def test_without_trajectories_and_truth_there_is_only_the_landscape():
     assert len(marks(axes, "+")) == 2
 
 
-def test_ends_alone_are_no_starts():
+def test_ends_without_starts():
     axes = Figure().add_subplot()
     draw_map(
         axes, PoseMap(relief=LANDSCAPE, solved=replace(solved_pair(PATHS, 0), starts=None, trajectories=None)), TRUTH
@@ -114,14 +114,14 @@ def test_360_degrees_is_0_again():
     assert np.array_equal(energy[:, 0], energy[:, -1]) and np.allclose(energy[:, :-1], LANDSCAPE.energy)
 
 
-def test_a_plain_is_drawn_as_well():
+def test_a_flat_landscape_is_drawn():
     plain = of([[1.0] * 6] * 4)
     for figure in (page(solved_pair(PATHS, 0, plain)), surface_figure(plain)):
         figure.draw_without_rendering()
 
 
-def test_the_map_says_the_same_in_grey():
-    """Lightness grows evenly from valley to height, so that print and colour blindness lose nothing."""
+def test_the_map_is_readable_in_grey():
+    """Lightness increases evenly with the energy, for print and colour blindness."""
     rgb = colormaps[RELIEF](np.linspace(0, 1, 64))[:, :3]
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     lightness = 116 * np.cbrt(linear @ [0.2126, 0.7152, 0.0722]) - 16
@@ -133,7 +133,7 @@ def test_the_map_says_the_same_in_grey():
 
 
 @pytest.mark.parametrize("count", [0, 1, 4, 9])
-def test_a_page_of_a_pair_has_all_in_its_place(count):
+def test_the_layout_of_the_page_of_a_pair(count):
     views = [IMAGE] * count
     captions = [f"{90 * number % 360}\u00b0: {number}\u00b0 off" for number in range(count)]
     paths = np.repeat(PATHS[:1], count, axis=0)
@@ -158,7 +158,7 @@ def test_a_page_of_a_pair_has_all_in_its_place(count):
     assert labels == {0: expected[::4], 1: [each for each in expected if each != "end"]}.get(count, expected)
 
 
-def test_a_long_key_stays_on_the_page():
+def test_a_long_legend_stays_on_the_page():
     figure = page(solved_pair(PATHS, 0), "tram")
     figure.draw_without_rendering()
     key = figure.legends[0].get_window_extent()
@@ -187,7 +187,7 @@ def test_the_surface_marks_the_truth_over_its_map():
 
 
 def seen(figure: Figure) -> NDArray[np.uint8]:
-    """The figure as pixels, 40 an inch."""
+    """The figure as pixels, at 40 dpi."""
     figure.set_dpi(40)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

@@ -1,4 +1,4 @@
-"""The grid of novel views: every view stands at its angles."""
+"""The grid of novel views: every view is at its angles."""
 
 from __future__ import annotations
 

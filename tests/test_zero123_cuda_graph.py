@@ -1,4 +1,4 @@
-"""Zero123's energy recorded and replayed: on a stand-in for CUDA graphs where there is no GPU, and on a GPU."""
+"""Zero123's energy recorded and replayed: with a mock of CUDA graphs, and on a GPU if there is one."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_replays_of_each_batch_size_give_what_the_function_gives(pools):
     assert pools == [None, 7]  # recorded for 3 and for 2 samples, in the same memory
 
 
-def test_a_prior_that_has_moved_is_recorded_anew(pools):
+def test_a_moved_prior_is_recorded_again(pools):
     graphed = prior_of(cuda_graph=True)
     energies_and_slopes(graphed, 2, 0)
     with torch.no_grad():
@@ -129,7 +129,7 @@ def test_a_prior_that_has_moved_is_recorded_anew(pools):
     assert not torch.allclose(stale, fresh, rtol=1e-3)  # the stand-in does keep addresses, as a GPU does
 
 
-def test_a_prior_that_is_let_go_of_is_gone_at_once_and_a_copy_records_for_itself(pools):
+def test_a_deleted_prior_is_freed_immediately_and_a_copy_has_its_own_recordings(pools):
     """Not when the garbage collector comes by: a GPU that is full does not call it."""
     graphed = prior_of(cuda_graph=True)
     energies_and_slopes(graphed, 2, 0)
@@ -140,7 +140,7 @@ def test_a_prior_that_is_let_go_of_is_gone_at_once_and_a_copy_records_for_itself
     assert unet() is None
 
 
-def test_recordings_are_given_back_before_a_batch_is_halved():
+def test_recordings_are_freed_before_a_batch_is_halved():
     def fits(part: slice) -> slice:
         if kept or part.stop - part.start > 3:
             raise torch.cuda.OutOfMemoryError("out of memory")

@@ -1,4 +1,4 @@
-"""Zero123 as a prior: its contract, and that every way to make it faster gives the same numbers."""
+"""Zero123 as a prior: its contract, and equal results for all speed settings."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_conditioning_vector():
     torch.testing.assert_close(conditioning_vector(pose), torch.tensor(expected, dtype=torch.float64))
 
 
-def test_a_turn_of_longitude_changes_nothing(prior, problem):
+def test_the_energy_is_periodic_in_the_longitude(prior, problem):
     target, source, pose, timestep, noise = problem
     turned = pose + torch.tensor([0, 2 * torch.pi, 0])
     close(prior.residual(target, source, turned, timestep, noise), prior.residual(*problem))
@@ -188,7 +188,7 @@ def test_attention_over_one_token_needs_no_query(prior, problem):
 
 
 @pytest.mark.parametrize("settings", [{"channels_last": True}, {"attention": "math"}, {"max_batch": 2}])
-def test_settings_of_speed_change_no_number(prior, problem, checkpoint, settings):
+def test_speed_settings_do_not_change_results(prior, problem, checkpoint, settings):
     other = small(Zero123(checkpoint, **settings))
     for actual, wanted in zip(energies_and_slopes(other, *problem), energies_and_slopes(prior, *problem), strict=True):
         close(actual, wanted, 1e-4)
@@ -204,7 +204,7 @@ def test_the_compiled_network_gives_the_same_numbers(prior, problem, checkpoint)
 
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
-def test_half_precision_keeps_energies_and_their_slopes(prior, problem, checkpoint, dtype):
+def test_half_precision_keeps_energies_and_gradients(prior, problem, checkpoint, dtype):
     other = small(Zero123(checkpoint, dtype=dtype))
     energies, slopes = energies_and_slopes(other, *problem)
     wanted, wanted_slopes = energies_and_slopes(prior, *problem)
@@ -232,7 +232,7 @@ def test_chunks_halve_when_memory_runs_out():
 
 
 def test_the_gradient_keeps_the_memory_of_one_chunk(prior, problem):
-    """After a forward pass nothing of the network's activations is left."""
+    """A forward pass keeps no activations of the network."""
     target, source, pose, timestep, noise = problem
     kept = []
     with torch.autograd.graph.saved_tensors_hooks(lambda tensor: kept.append(tensor.numel()) or tensor, lambda x: x):

@@ -1,4 +1,4 @@
-"""Loading Zero123's weights: what is read, what it costs, and every bad input told in one sentence."""
+"""Loading Zero123's weights: the tensors read, the memory needed, and a message for every bad input."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_tensor_of_another_shape_is_named(tensors, tmp_path):
     assert "other shapes" in refused(saved({**tensors, SIZING: torch.zeros(())}, tmp_path), "raw")
 
 
-def test_known_left_overs_are_left(tensors, tmp_path, networks):
+def test_known_extra_tensors_are_ignored(tensors, tmp_path, networks):
     tables = ("betas", "alphas_cumprod", "alphas_cumprod_prev", "sqrt_alphas_cumprod", "log_one_minus_alphas_cumprod")
     tables += ("sqrt_one_minus_alphas_cumprod", "sqrt_recip_alphas_cumprod", "sqrt_recipm1_alphas_cumprod")
     tables += ("posterior_variance", "posterior_log_variance_clipped", "posterior_mean_coef1", "posterior_mean_coef2")
@@ -155,7 +155,7 @@ def test_known_left_overs_are_left(tensors, tmp_path, networks):
     assert same(load_networks(str(path), None, "ema", "float32"), networks)
 
 
-def test_other_models_are_no_zero123(tensors, tmp_path):
+def test_other_models_are_refused(tensors, tmp_path):
     stable_diffusion = {key: value for key, value in tensors.items() if not key.startswith("cc_projection")}
     assert "no 'cc_projection.weight'" in refused(saved({"state_dict": stable_diffusion}, tmp_path))
     assert "unknown tensor 'fc.weight'" in refused(saved({"fc.weight": torch.zeros(2)}, tmp_path))
@@ -298,7 +298,7 @@ def test_methods_reached_through_a_known_name_are_not_run(tmp_path):
     assert "no named tensors" in refused(path)  # an empty object came of it
 
 
-def test_objects_of_the_training_code_are_passed_over(tensors, tmp_path, monkeypatch, networks):
+def test_objects_of_the_training_code_are_ignored(tensors, tmp_path, monkeypatch, networks):
     """As in published files: a callback's class as a key, its state, hyper-parameters, numbers of numpy."""
     module = types.ModuleType("pytorch_lightning.callbacks.model_checkpoint")
 
@@ -441,7 +441,7 @@ def test_bad_folders(folder, tmp_path):
     assert 'Unexpected key(s) in state_dict: "extra"' in refused(path)
 
 
-def test_writing_is_all_or_nothing(networks, folder, tmp_path, monkeypatch):
+def test_writing_is_atomic(networks, folder, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="converted: cannot be written"):
         write_folder(networks, folder)
     assert (folder / "unet" / "config.json").is_file()
@@ -481,7 +481,7 @@ def test_no_network_is_one_sentence(monkeypatch, tmp_path):
     assert "does not provide it (no route to host); set prior.path to" in refused("someone/zero123")
 
 
-def test_of_a_repository_only_what_is_needed_is_downloaded(monkeypatch, folder, networks):
+def test_only_required_files_of_a_repository_are_downloaded(monkeypatch, folder, networks):
     asked = {}
 
     def files(self, hub_id, revision=None):
@@ -500,7 +500,7 @@ def test_of_a_repository_only_what_is_needed_is_downloaded(monkeypatch, folder, 
     assert not {"unet/diffusion_pytorch_model.bin", "safety_checker/model.safetensors"} & set(asked["patterns"])
 
 
-def test_a_repository_that_is_not_there(monkeypatch):
+def test_a_missing_repository(monkeypatch):
     from huggingface_hub.errors import RepositoryNotFoundError
 
     response = types.SimpleNamespace(status_code=404, headers={}, request=None)

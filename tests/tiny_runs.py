@@ -70,7 +70,7 @@ BACKBONE = '''
 
 @dataclass
 class Ran:
-    """A command that has run: exit status, what it printed, and its folder."""
+    """A finished command: exit status, output and folder."""
 
     status: int
     out: str
@@ -87,7 +87,7 @@ class Ran:
 
     @property
     def error(self) -> str:
-        """Its one sentence, of a mistake of the user."""
+        """The message of a user error, one sentence."""
         lines = self.err.splitlines()
         assert self.status == 1 and len(lines) == 1 and lines[0].startswith("error: "), self.err
         return lines[0].removeprefix("error: ")
@@ -136,14 +136,14 @@ class Commands:
         return Ran(status, out.getvalue(), err.getvalue(), self.folder / name)
 
     def start(self, name: str, command: str, *overrides: str) -> subprocess.Popen[str]:
-        """Start a process of its own."""
+        """Start a subprocess."""
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         line = [sys.executable, "-m", "lp_framework", *self.arguments(name, command, *overrides)]
         pipe = subprocess.PIPE
         return subprocess.Popen(line, cwd=self.folder, env=environment, stdout=pipe, stderr=pipe, text=True)
 
     def process(self, name: str, command: str, *overrides: str) -> Ran:
-        """Run in a process of its own."""
+        """Run in a subprocess."""
         process = self.start(name, command, *overrides)
         out, err = process.communicate(timeout=300)
         return Ran(process.returncode, out, err, self.folder / name)
@@ -151,7 +151,7 @@ class Commands:
 
 @contextlib.contextmanager
 def _aside(folder: Path) -> Iterator[None]:
-    """What a command changes in this process is put back."""
+    """Restore what a command changes in this process."""
     here, argv, path = Path.cwd(), sys.argv, list(sys.path)
     state, deterministic = registry._state, torch.are_deterministic_algorithms_enabled()
     registry._state = copy.deepcopy(state)
