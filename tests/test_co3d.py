@@ -284,7 +284,7 @@ def test_scenes_are_drawn_once_and_kept(tmp_path):
     assert CO3DData(str(root), **settings, objects=names).names() == names[::-1]
     with pytest.raises(UserError, match=rf"there is no 'bal-{SEQUENCE}' in .*did you mean 'ball-{SEQUENCE}'"):
         CO3DData(str(root), **settings, objects=[f"bal-{SEQUENCE}"]).names()
-    with pytest.raises(UserError, match="4 objects are there, but 29 are needed"):
+    with pytest.raises(UserError, match="found 4 objects, but 29 are needed"):
         CO3DData(str(root), views=str(tmp_path / "others")).names()
 
 
@@ -341,7 +341,7 @@ CLOUD = Path("hydrant", SEQUENCE, "pointcloud.ply")
             ),
             "is not readable gzipped JSON",
         ),
-        (lambda root: (root / "hydrant" / SET_LIST).write_text("[]"), "is no set list of CO3Dv2"),
+        (lambda root: (root / "hydrant" / SET_LIST).write_text("[]"), "is not a set list of CO3Dv2"),
         (
             lambda root: (root / "hydrant" / SET_LIST).unlink(),
             r"looked for .*/set_lists/set_lists_manyview_dev_0\.json",

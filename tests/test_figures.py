@@ -274,7 +274,7 @@ PRIOR = """
 
     @register("prior", "tmp_valleys")
     class Valleys(ExactPrior):
-        "Two valleys."
+        "Two minima."
 
         def __init__(self) -> None:
             super().__init__((0.0, math.pi), (0.0, 0.3))

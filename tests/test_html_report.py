@@ -172,7 +172,7 @@ def evaluation() -> tuple[Evaluation, PairData]:
     data = Exact(ViewTable(objects), np.zeros((24, 8, 8, 3), dtype=np.uint8), None)
     solver = TwoStage(Reader(), ExactPrior((0.0, torch.pi), (0.0, 0.3)), gamma=0.0, iterations=12, refinement_steps=8)  # type: ignore[arg-type]
     evaluation = Evaluation(solver, Ring(3), seed=0)
-    evaluation.gather_for(data.table)
+    evaluation.reset_metrics(data.table)
     with torch.no_grad():
         evaluation.test_step(data[data.table.pairs()], 0)
     evaluation.metrics.compute()

@@ -27,7 +27,7 @@ def test_a_drawn_division_is_seeded_disjoint_and_of_the_size_asked(seen, unseen)
 
 
 def test_impossible_divisions():
-    with pytest.raises(UserError, match="here: 12 objects are there, but 13 are needed"):
+    with pytest.raises(UserError, match="here: found 12 objects, but 13 are needed"):
         drawn(NAMES, 10, 3, 0, Path("here"))
     with pytest.raises(UserError, match="must not be negative"):
         drawn(NAMES, None, -1, 0, Path("here"))
@@ -42,7 +42,7 @@ def test_lists_are_written_once_and_read_afterwards(tmp_path):
     ):
         kept_lists(tmp_path / "views", {"seed": 1}, lambda: first)
     (tmp_path / "views" / "objects.json").write_text("[]")
-    with pytest.raises(UserError, match="is no list of objects"):
+    with pytest.raises(UserError, match="is not a valid list of objects"):
         kept_lists(tmp_path / "views", {"seed": 0}, lambda: first)
 
 
@@ -104,7 +104,7 @@ def grey_view(camera) -> View:
 
 
 def test_bad_divisions(meshes):
-    with pytest.raises(UserError, match="12 objects are there, but 13 are needed"):
+    with pytest.raises(UserError, match="found 12 objects, but 13 are needed"):
         names(meshes, unseen=12)
     with pytest.raises(UserError, match=r"data\.objects=unseen: there are none; set data\.unseen"):
         names(meshes, objects="unseen")

@@ -268,9 +268,9 @@ def moved_by(**settings):
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (faded, "not drawn of its materials: transparency"),
-        (material(emissiveFactor=[0, 1, 0]), "not drawn of its materials: emitted light"),
-        (lambda folder: Gltf(uv=None).write(folder), "not drawn of its materials: textures (it has no coordinates"),
+        (faded, "ignored features of its materials: transparency"),
+        (material(emissiveFactor=[0, 1, 0]), "ignored features of its materials: emitted light"),
+        (lambda folder: Gltf(uv=None).write(folder), "ignored features of its materials: textures (it has no"),
         (lambda folder: write_obj(folder, mtl="newmtl m\nd .5\nmap_Kd tex.png\n"), "of its materials: transparency"),
         (lambda folder: write_obj(folder, mtl="newmtl m\nKe 0 1 0\nmap_Kd tex.png\n"), "materials: emitted light"),
         (moved_by(skin=0), "its skeleton (skins) is left out"),

@@ -160,7 +160,7 @@ def alone(root: Path) -> None:
         (scaled, r"poses/001\.npy: its camera is not a rigid camera-to-world transform"),
         (y_up, r"poses/001\.npy: its camera does not look at the origin with \+Z up"),
         (at_the_centre, r"poses/001\.npy: its camera must not be at the origin"),
-        (alone, r"dinosaur_002/poses: two or more poses \(\*\.npy\) are needed, 1 are there"),
+        (alone, r"dinosaur_002/poses: two or more poses \(\*\.npy\) are needed, found 1"),
     ],
 )
 def test_bad_input(data, root, tmp_path, damage, message):

@@ -18,7 +18,7 @@ from lp_framework.data.pairs import (
     ViewTable,
     as_images,
     in_batches,
-    share_out,
+    shard_batches,
 )
 from lp_framework.data.views import ObjectViews
 from lp_framework.errors import UserError
@@ -254,7 +254,7 @@ def test_an_object_with_one_view_cannot_be_trained_on():
 @given(st.integers(1, 60), st.integers(1, 25), st.integers(1, 5))
 def test_a_list_goes_through_in_order_with_repeats_at_the_end_only(count, batch_pairs, ranks):
     pairs = np.arange(2 * count).reshape(count, 2)
-    shares = [share_out(in_batches(pairs, batch_pairs), rank, ranks) for rank in range(ranks)]
+    shares = [shard_batches(in_batches(pairs, batch_pairs), rank, ranks) for rank in range(ranks)]
     in_turn = [batch for turn in zip(*shares, strict=True) for batch in turn]
     batches = math.ceil(count / batch_pairs)
     np.testing.assert_array_equal(np.concatenate(in_turn[:batches]), pairs)

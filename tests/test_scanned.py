@@ -84,7 +84,7 @@ def test_bad_downloads(tmp_path):
         gso(tmp_path / "nowhere").names()
     with pytest.raises(UserError, match=r"holds no objects of GSO; looked for .*\*/meshes/model\.obj"):
         gso(root / "Object_0").names()
-    with pytest.raises(UserError, match="9 objects are there, but 80 are needed"):
+    with pytest.raises(UserError, match="found 9 objects, but 80 are needed"):
         gso(root, seen=70, unseen=10).names()
     with pytest.raises(UserError, match=r"looked for .*\*/\*/Scan/Scan\.obj"):
         OO3DData(None, str(root), views=str(tmp_path / "views")).names()

@@ -100,7 +100,7 @@ def test_a_solver_gets_sets_and_its_answers_are_returned_per_image(data):
     data.prepare_data()
     (batch,) = data.test_dataloader()
     evaluation = Evaluation(Remembering(), Random(2), seed=3, views=3)
-    evaluation.gather_for(data.table("test"))
+    evaluation.reset_metrics(data.table("test"))
     evaluation.test_step(batch, 0)
     ((asked, starts),) = evaluation.solver.asked
     assert torch.equal(asked.images, batch.images)
@@ -125,7 +125,7 @@ def test_a_sets_id_is_that_of_its_images_wherever_it_is_evaluated(data):
         sets = table.view_sets(3)[list(chosen)]
         pairs = np.stack([np.repeat(sets[:, :1], 2, axis=1), sets[:, 1:]], axis=-1).reshape(-1, 2)
         evaluation = Evaluation(Remembering(), Random(2), seed=0, views=3)
-        evaluation.gather_for(table)
+        evaluation.reset_metrics(table)
         evaluation.test_step(data.data("test")[pairs], 0)
         ((asked, starts),) = evaluation.solver.asked
         ids.append((asked.ids, starts))

@@ -417,7 +417,7 @@ def data() -> PairData:
 
 def evaluated(solver: Solver, data: PairData, starts: Ring | GridStarts) -> Evaluation:
     evaluation = Evaluation(solver, starts, seed=0)
-    evaluation.gather_for(data.table)
+    evaluation.reset_metrics(data.table)
     with torch.no_grad():
         evaluation.test_step(data[data.table.pairs()], 0)
     return evaluation

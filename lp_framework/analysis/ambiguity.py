@@ -1,7 +1,7 @@
 """How well a prior's energy identifies the azimuth of an object, and how ambiguous its views leave it.
 
 The *valley floor* is the lowest energy at each longitude, relative to the range of its landscape. Its mean over pairs,
-each rotated so that the truth is at 0, shows the valleys of the object itself.
+each rotated so that the truth is at 0, shows the minima of the object itself.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lp_framework.analysis.fields import Draws, pose_energies, prior_landscapes
-from lp_framework.analysis.landscapes import FLAT, Grid, Landscape, valleys
+from lp_framework.analysis.landscapes import FLAT, Grid, Landscape, find_minima
 from lp_framework.data.cache import tracked
 from lp_framework.data.module import PairDataModule
 from lp_framework.geometry import wrap_angle
@@ -24,7 +24,7 @@ from lp_framework.solvers.base import Pairs, pairs_of
 
 NEAR_DEGREES = 15.0
 PROMINENCE = 0.1  # of a profile's range; shallower dips do not count as minima
-EQUAL = 0.05  # of the floor's range; valleys whose depths differ by less are equally good answers
+EQUAL = 0.05  # of the floor's range; minima whose depths differ by less are equally good answers
 HALF_TURN = 30.0  # degrees; tolerance around 180 for a second valley to count as half a turn away
 PAIRS = 8  # per object, to compute its ambiguity
 
@@ -57,7 +57,7 @@ class Profile(NamedTuple):
 
     def minima(self) -> list[dict[str, float]]:
         """Local minima, deepest first: `degrees` from the truth, and `height` within the profile's range."""
-        found = valleys(self.energy[None], PROMINENCE)
+        found = find_minima(self.energy[None], PROMINENCE)
         return [{"degrees": self.degrees[cell].item(), "height": height} for cell, height, _ in found]
 
 
@@ -85,7 +85,7 @@ class Ambiguity(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """`continuous` if the floor is flat; else by its valleys: one, two half a turn apart, or any others."""
+        """`continuous` if the floor is flat; else by its minima: one, two half a turn apart, or any others."""
         if self.flatness >= FLAT:
             return "continuous"
         places = [minimum["degrees"] for minimum in self.floor.minima()]

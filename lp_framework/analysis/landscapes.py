@@ -1,4 +1,4 @@
-"""Energy landscapes over relative latitude and longitude as plain arrays, their valleys, and score fields.
+"""Energy landscapes over relative latitude and longitude as plain arrays, their local minima, and score fields.
 
 See the paper's Figures 1 and 2 (appendix, Additional Zero123 MSE Landscape Visualization); `fields` fills the arrays.
 """
@@ -47,10 +47,10 @@ class Landscape(NamedTuple):
     energy: Tensor
 
     def minima(self) -> list[LandscapeMinimum]:
-        """Local minima, deepest first; see `valleys`. Positions are refined by a parabola along each angle."""
+        """Local minima, deepest first; see `find_minima`. Positions are refined by a parabola along each angle."""
         return [
             LandscapeMinimum(*self._place(cell), self.energy.flatten()[cell].item(), height, prominence)
-            for cell, height, prominence in valleys(self.energy, PROMINENCE)
+            for cell, height, prominence in find_minima(self.energy, PROMINENCE)
         ]
 
     def floor(self) -> Tensor:
@@ -85,13 +85,13 @@ def _vertex(left: float, middle: float, right: float) -> float:
     return min(max((left - right) / (2 * curvature), -0.5), 0.5) if curvature > 0 else 0.0
 
 
-def valleys(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
-    """Find the valleys of energies `[A, O]` with a prominence of at least `least`, deepest first.
+def find_minima(energy: Tensor, least: float) -> list[tuple[int, float, float]]:
+    """Find the local minima of energies `[A, O]` with a prominence of at least `least`, deepest first.
 
-    Returns the index of each valley's lowest point in the flattened grid, and its `height` and `prominence` as in
+    Returns the index of each minimum in the flattened grid, and its `height` and `prominence` as in
     `LandscapeMinimum`. Points have eight neighbours; the grid is periodic in longitude and open in latitude, so a
     minimum on the border counts. A plateau of equal energies is one minimum, a saddle is none. Energies that are not
-    finite are ignored, and a flat landscape has no valley.
+    finite are ignored, and a flat landscape has no minimum.
     """
     rows, columns = energy.shape
     heights = energy.double().flatten().tolist()

@@ -29,7 +29,7 @@ from lp_framework.atomic import DiskFull
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.views import ViewSource
 from lp_framework.errors import UserError, one_line
-from lp_framework.models.checkpoints import WholeCheckpointIO, describe, find_checkpoint, load_model
+from lp_framework.models.checkpoints import AtomicCheckpointIO, describe, find_checkpoint, load_model
 from lp_framework.run_folders import relative
 
 log = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ def build_trainer(
             default_root_dir=folder,
             callbacks=callbacks,
             logger=logger,
-            plugins=[WholeCheckpointIO()],
+            plugins=[AtomicCheckpointIO()],
             use_distributed_sampler=False,  # the data module's samplers handle the processes
         )
     except (MisconfigurationException, ImportError, ValueError, TypeError) as error:

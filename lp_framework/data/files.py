@@ -225,7 +225,7 @@ def drawn(available: Sequence[str], seen: int | None, unseen: int, seed: int, wh
         raise UserError(f"{where}: the numbers of objects must not be negative, got {seen} seen and {unseen} unseen")
     if len(names) < needed:
         wanted = f"{needed} are needed ({seen} seen and {unseen} unseen)"
-        raise UserError(f"{where}: {len(names)} objects are there, but {wanted}")
+        raise UserError(f"{where}: found {len(names)} objects, but {wanted}")
     order = [names[index] for index in np.random.default_rng(seed).permutation(len(names))]
     return ObjectLists(sorted(order[unseen:needed]), sorted(order[:unseen]))
 
@@ -241,7 +241,7 @@ def kept_lists(views: Path, how: dict[str, Any], choose: Callable[[], ObjectList
                 with written(path) as partial:
                     partial.write_text(json.dumps({"chosen": how, **lists._asdict()}, indent=1))
     content = read_json(path)
-    with expecting(f"{path}: is no list of objects as this program writes it; delete it to choose anew"):
+    with expecting(f"{path}: is not a valid list of objects; delete it to choose them again"):
         changed = differences(content["chosen"], how)
         seen, unseen = ([str(name) for name in content[key]] for key in ("seen", "unseen"))
     if changed:

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from lp_framework.data.cache import cached_array, cores, decoded_views, tracked
 from lp_framework.data.files import content_key
-from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, ViewTable, as_images, in_batches, share_out
+from lp_framework.data.pairs import BlockSampler, PairBatch, PairData, ViewTable, as_images, in_batches, shard_batches
 from lp_framework.data.photographic import decoded_renderings
 from lp_framework.data.views import FIELD_OF_VIEW_DEGREES, ObjectViews, ViewSource
 from lp_framework.errors import UserError, check_settings
@@ -235,7 +235,7 @@ class PairDataModule(LightningDataModule):
         return self._listed(data, left)
 
     def _listed(self, data: PairData, batches: Sequence[NDArray[np.int64]]) -> DataLoader[PairBatch]:
-        return DataLoader(data, batch_size=None, sampler=share_out(batches, *self._ranks()))
+        return DataLoader(data, batch_size=None, sampler=shard_batches(batches, *self._ranks()))
 
 
 def _folder(split: str) -> str:

@@ -245,7 +245,7 @@ def in_batches(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
     return [pairs[start : start + count] for start in range(0, len(pairs), count)]
 
 
-def share_out(batches: Sequence[NDArray[np.int64]], rank: int = 0, ranks: int = 1) -> list[NDArray[np.int64]]:
+def shard_batches(batches: Sequence[NDArray[np.int64]], rank: int = 0, ranks: int = 1) -> list[NDArray[np.int64]]:
     """The batches of process `rank` of `ranks`. All processes get the same number: if it does not divide evenly, the
     last ones repeat earlier batches, and the metrics count each pair once."""
     rounds = -(-len(batches) // ranks)

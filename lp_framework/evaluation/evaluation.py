@@ -48,7 +48,7 @@ class Evaluation(LightningModule):
     def setup(self, stage: str) -> None:
         """Create the metrics, once the data and their objects are known, and read the journal."""
         data: PairDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        self.gather_for(data.table(data.evaluation_split()))
+        self.reset_metrics(data.table(data.evaluation_split()))
         found: list[SolvedBatch] | UserError = []
         # Only one process reads the journal, so that no other reads lines added by this run.
         if self.journal is not None and self.trainer.is_global_zero:
@@ -68,7 +68,7 @@ class Evaluation(LightningModule):
         for batch in found[self.trainer.global_rank :: self.trainer.world_size] or found[:1]:
             self.metrics.update(batch)
 
-    def gather_for(self, table: ViewTable) -> None:
+    def reset_metrics(self, table: ViewTable) -> None:
         """Reset the metrics, for pairs of the views in `table`."""
         self.table = table
         self.metrics = PoseMetrics(table, self.solver.one_answer)

@@ -40,7 +40,7 @@ CONFIG, WEIGHTS = "model.json", "model.safetensors"
 ORIGIN = ("config.yaml", "training.json", "metrics.csv", "training.png")  # files copied from a run's folder
 
 
-class WholeCheckpointIO(TorchCheckpointIO):
+class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes Lightning's checkpoints atomically. Lightning itself copies them over the old ones from the system's
     temporary folder if that is on another disk."""
 

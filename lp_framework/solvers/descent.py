@@ -98,7 +98,7 @@ def descend(
     total = torch.zeros_like(optimizer.rate)
     sound, place = parameters, pose_of(parameters)  # the last ones with a finite energy and gradient, per start
     trajectory = []
-    for step in steps_of(steps, "descending the prior"):
+    for step in steps_of(steps, "minimizing the energy"):
         variable = parameters.detach().clone().requires_grad_()
         with torch.enable_grad():
             pose = pose_of(variable)

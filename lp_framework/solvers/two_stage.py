@@ -150,7 +150,7 @@ class GaussNewton(Solver):
         damping = self.damping * here.hessian.diagonal(dim1=-2, dim2=-1).amax(dim=-1)  # [B, N]
         growth = torch.full_like(damping, 2.0)
         identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
-        for _ in steps_of(self.steps, "descending the prior"):
+        for _ in steps_of(self.steps, "minimizing the energy"):
             damped = here.hessian + damping[..., None, None] * identity
             solved, _ = torch.linalg.solve_ex(damped, here.gradient)
             length = torch.linalg.vector_norm(solved, dim=-1, keepdim=True)

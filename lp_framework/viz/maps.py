@@ -25,7 +25,7 @@ from lp_framework.analysis.pairs import PoseMap, ShownPair
 from lp_framework.viz import style
 
 SEAM = 0.5  # degrees; points closer to the seam are drawn on both sides of it
-# Dark valleys to light peaks, even in lightness, so that it works in grey and for any kind of colour vision.
+# Dark minima to light maxima, with even lightness, so that it works in grey and for any kind of colour vision.
 RELIEF = "cividis"
 LEVELS = 9  # contour lines
 

@@ -42,7 +42,7 @@ def read_mesh(path: Path, folders: Sequence[Path]) -> trimesh.Scene:
     for mesh in meshes:
         _clean(path, mesh)
     if left_out := sorted(set().union(*map(_left_out, meshes))):
-        warn(path, f"not drawn of its materials: {', '.join(left_out)}")
+        warn(path, f"ignored features of its materials: {', '.join(left_out)}")
     return scene
 
 

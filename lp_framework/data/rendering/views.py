@@ -36,7 +36,7 @@ from lp_framework.geometry import camera_to_world
 
 RECORD = "render.json"
 # Settings that records omit at these values, for compatibility with older records.
-LATER = {"train_views": None, "depth": False, "field_of_view_range": None}
+OMITTED = {"train_views": None, "depth": False, "field_of_view_range": None}
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def render_object(
                 partial.write_text(json.dumps(record | made_from, indent=1))
         return
     labels = {"ambiguity": obj.ambiguity, "unique_answer": obj.unique_answer}
-    settings = {key: value for key, value in asdict(protocol).items() if key not in LATER or value != LATER[key]}
+    settings = {key: value for key, value in asdict(protocol).items() if key not in OMITTED or value != OMITTED[key]}
     record = {"object": obj.name, **made_from, "renderer": renderer.name, **labels, "protocol": settings}
     protocol = protocol.of_object(obj.name)
     splits = {"train": protocol.training_poses(obj.name), "test": protocol.test_poses(obj.name)}
@@ -183,7 +183,7 @@ def _changes(folder: Path, protocol: ViewProtocol) -> str:
     if not isinstance(record.get("protocol"), dict):
         return f"it has no valid {RECORD}"
     wanted = {key: value for key, value in asdict(protocol).items() if value or key != "depth"}
-    return differences({**LATER, **record["protocol"]}, wanted)
+    return differences({**OMITTED, **record["protocol"]}, wanted)
 
 
 def render_objects(

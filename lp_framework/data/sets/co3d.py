@@ -98,7 +98,7 @@ class CO3DData(PhotographedData):
         for file in (folder / "set_lists" / f"set_lists_{subset}.json" for subset in self.subsets):
             if file.is_file():
                 content = read_json(file)
-                with expecting(f"{file}: is no set list of CO3Dv2"):
+                with expecting(f"{file}: is not a set list of CO3Dv2"):
                     listed |= {(str(name), int(number)) for frames in content.values() for name, number, _ in frames}
         return listed
 

@@ -75,7 +75,7 @@ def omni3d_cameras(root: str | Path, name: str) -> dict[str, Tensor]:
     folder = Path(root) / name / "poses"
     files = sorted(folder.glob("*.npy"))
     if len(files) < 2:
-        raise UserError(f"{folder}: two or more poses (*.npy) are needed, {len(files)} are there")
+        raise UserError(f"{folder}: two or more poses (*.npy) are needed, found {len(files)}")
     turned = []
     for file in files:
         with expecting(f"{file}: must be a 4 x 4 camera-to-world matrix of finite numbers"):
