@@ -12,7 +12,7 @@ $python -m lp_framework estimate "images=[docs/pictures/example_0.png,docs/pictu
 echo
 run="runs/quickstart"
 if [ -f "$run/training.json" ] && [ $# -eq 0 ]; then
-    echo "quickstart: $run holds a trained model; delete the folder to train anew"
+    echo "quickstart: $run contains a trained model; delete the folder to train again"
 elif [ -f "$run/checkpoints/last.ckpt" ] && [ $# -eq 0 ]; then
     echo "quickstart: going on with the training in $run"
     $python -m lp_framework train "resume=$run"

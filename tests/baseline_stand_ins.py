@@ -94,7 +94,7 @@ def pose_encoding_to_extri_intri(encoding: Tensor, image_size_hw: Any) -> tuple[
 
 
 def inference(pairs: list[tuple[dict, dict]], model: nn.Module, device: Any, batch_size: int) -> dict[str, dict]:
-    """DUSt3R's: dicts of both views and predictions, with the pairs along the batch; point maps of one place a pixel.
+    """DUSt3R's dicts of both views and predictions, with pairs along the batch; one point per pixel.
 
     A camera is in no output: `pts3d` are the first view's points in its own frame, `pts3d_in_other_view` the second
     view's in the first one's.

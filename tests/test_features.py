@@ -348,7 +348,7 @@ def test_a_learned_matcher_gives_places_on_both_objects_in_the_images_pixels(tmp
 
         def forward(self, pixel_values: Tensor) -> LightGlueKeypointMatchingOutput:
             assert pixel_values.shape == (1, 2, 3, 640, 640) and 0 <= pixel_values.min() <= pixel_values.max() <= 1
-            # Of the 640 pixels a side: the image's middle, a quarter, and the corner, which is white.
+            # Of the 640 pixels per side: the image's middle, a quarter, and the corner, which is white.
             points = torch.tensor([[319.5, 319.5], [300.0, 330.0], [0.0, 0.0], [310.0, 310.0]]) / 640
             return LightGlueKeypointMatchingOutput(
                 keypoints=points.expand(1, 2, 4, 2),

@@ -105,7 +105,7 @@ def test_probing_and_steps_meet_the_published_timesteps(monkeypatch):
     solution = IDPose(prior).solve(pairs, unused(pairs), seed=0)
     probe = [200, 200, 201, 201, 202, 203, 203, 204, 205, 205, 206, 206, 207, 208, 208, 209]
     wanted = [(80, each) for each in probe]  # 8 x 5 candidates in both directions
-    wanted += [(20, 200)] * 10  # half of them, a direction a step
+    wanted += [(20, 200)] * 10  # half of them, one direction per step
     wanted += [(40, each) for each in probe]
     wanted += [(1, 200)] * 600
     assert met == wanted

@@ -140,8 +140,8 @@ def test_with_the_periodic_target_two_opposite_answers_leave_a_field_half_a_turn
 
 
 @pytest.mark.parametrize("noise", ["uniform", "gaussian"])
-def test_a_network_that_sees_the_pair_learns_a_field_a_pair(noise):
-    """The condition y matters: a network linear in the pose with an offset a pair has the unique answers' optimum."""
+def test_a_network_conditioned_on_the_pair_learns_one_field_per_pair(noise):
+    """The condition y matters: a network linear in the pose with an offset per pair has the unique answers' optimum."""
     generator = torch.Generator().manual_seed(0)
     answers = torch.tensor([[0.2, 2.0, -0.1], [-0.3, 4.0, 0.2]], dtype=torch.float64)
     pair = torch.randint(2, (4_000,), generator=generator)

@@ -193,5 +193,5 @@ def test_mistakes_are_named(commands):
         f"object '{sorted(OBJECTS)[0]}' has {TEST_VIEWS} views here; sets of views=6 need as many"
     )
     assert commands.here("x", "eval", "checkpoint=./score", "views=3", "protocol=per_view").error == (
-        "protocol=per_view is for pairs; views=3 has a protocol of its own, so leave it out"
+        "protocol=per_view is for pairs; views=3 has its own protocol, so leave it out"
     )

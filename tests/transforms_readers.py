@@ -72,7 +72,7 @@ def as_instant_ngp(folder: Path) -> list[Read]:
 
 
 def as_ifusion(folder: Path) -> list[tuple[Path, NDArray, list[float]]]:
-    """File, camera to world, and `latlon` of every frame; images are 256 pixels a side."""
+    """File, camera to world, and `latlon` of every frame; images are 256 pixels per side."""
     read = []
     for frame in _content(folder)["frames"]:
         with Image.open(folder / frame["file_path"]) as image:

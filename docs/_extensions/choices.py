@@ -123,7 +123,7 @@ def row(*cells: Sequence[nodes.Node]) -> nodes.row:
 
 
 def prose(comment: str) -> list[nodes.Node]:
-    """The text of a comment, with what stands between backticks as code."""
+    """The text of a comment, with text between backticks as code."""
     parts = enumerate(comment.split("`"))
     return [
         nodes.literal("", part) if number % 2 else nodes.Text(part)

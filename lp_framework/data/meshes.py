@@ -38,7 +38,7 @@ Ambiguity = Literal["unique", "twofold", "continuous", "unlabelled"]
 
 NEUTRAL_GREY = 0.6  # linear reflectance of parts without texture or colour
 CREASE_ANGLE = np.radians(40)  # edges that bend less are shaded smoothly
-LARGEST_TEXTURE = 2048  # pixels a side, finer than the views can show
+LARGEST_TEXTURE = 2048  # pixels per side, finer than the views can show
 UP_AXES = {".glb": "y", ".gltf": "y", ".3mf": "z"}  # of formats with a standardized up axis
 
 

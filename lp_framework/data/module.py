@@ -44,7 +44,7 @@ class FeatureExtractor(Protocol):
 class PairDataModule(LightningDataModule):
     """Ordered pairs among the views of each object of a source.
 
-    `cache` is the folder of decoded views (square, `image_size` pixels a side). A training batch has about
+    `cache` is the folder of decoded views (square, `image_size` pixels per side). A training batch has about
     `batch_pairs` pairs over blocks of `block` views (see `BlockSampler`). To choose the best checkpoint,
     `validation_views` of each object's training views are held out; with `validation_objects`, that many whole objects
     are held out instead, and `validation_views` of each are used. Test views are used only for evaluation; with `crop`
@@ -159,9 +159,7 @@ class PairDataModule(LightningDataModule):
         if views is not None and (not isinstance(views, int) or not 2 <= views <= LARGEST_SET):
             raise UserError(f"views must be 2 to {LARGEST_SET} images, or null for pairs; got {views}")
         if views is not None and protocol != "ordered":
-            raise UserError(
-                f"protocol={protocol} is for pairs; views={views} has a protocol of its own, so leave it out"
-            )
+            raise UserError(f"protocol={protocol} is for pairs; views={views} has its own protocol, so leave it out")
         self._evaluation, self._views, self._evaluation_pairs = (protocol, seed), views, batch_pairs
 
     def leave_out(self, pairs: Iterable[Sequence[int]]) -> None:

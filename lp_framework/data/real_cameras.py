@@ -109,7 +109,7 @@ def crop_field_of_view(distance: Tensor, radius: Tensor) -> Tensor:
 
 
 def crop_homography(camera: Tensor, intrinsics: Tensor, radius: Tensor, size: int) -> Tensor:
-    """Homography `[..., 3, 3]` from points of the crop, in pixels of `size` a side, to those of the photograph with
+    """Homography `[..., 3, 3]` from points of the crop, in pixels (`size` per side), to those of the photograph with
     this `camera` `[..., 4, 4]` and `intrinsics` `[..., 3, 3]`; `radius` `[...]` is the effective one."""
     turned, _ = turn_towards_centre(camera)
     half = torch.tan(crop_field_of_view(camera[..., :3, 3].norm(dim=-1), radius) / 2)

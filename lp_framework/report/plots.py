@@ -101,7 +101,7 @@ def losses_plot(losses: Mapping[str, Curve], rate: Curve | None) -> go.Figure:
 
 def cameras_plot(poses: NDArray, images: Sequence[NDArray], field_of_view: float) -> go.Figure:
     """Plot cameras of one field of view (radians) at view poses `[V, 3]` with their images `[S, S, 4]`. The first image
-    also stands for the object."""
+    also represents the object."""
     furthest = float(poses[:, 2].max())
     figure = _space(1.1 * furthest, poses[0, 1])
     figure.add_trace(_image(_frustum(poses[0], poses[0, 2], field_of_view), images[0], 2 * PIXELS))

@@ -125,7 +125,7 @@ def cameras_figure(
 ) -> Figure:  # fmt: skip
     """Draw cameras at view poses `[V, 3]` around the object, each with an image (RGBA), number and title. Below are the
     first `MOST_CARDS` images with their poses and `verdicts` (keys of `TRUSTED`, or empty). The first image is the
-    reference and also stands for the object.
+    reference and also represents the object.
     """
     verdicts = verdicts or [""] * len(images)
     cameras, half_angle, furthest = _cameras(poses), math.radians(field_of_view_degrees) / 2, float(poses[:, 2].max())

@@ -277,7 +277,7 @@ def spread(directions: NDArray[np.floating], count: int, random: np.random.Gener
 
 
 def crop(view: SphericalView, size: int) -> Image.Image:
-    """The object-centric crop of a photograph, RGBA of `size` pixels a side, transparent where the mask is dark and
+    """The object-centric crop of a photograph, RGBA of `size` pixels per side, transparent where the mask is dark and
     outside the photograph."""
     photograph = view.photograph
     cut = photograph.colours()
