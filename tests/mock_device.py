@@ -43,18 +43,13 @@ class MockTensor(Tensor):
     wrapped: Tensor
 
     @staticmethod
-    def __new__(cls, wrapped: Tensor) -> MockTensor:
-        if wrapped.dtype in Unsupported.dtypes:
-            raise TypeError(f"mock:0 has no {wrapped.dtype}; use float32 there")
+    def __new__(cls, cpu: Tensor) -> MockTensor:
+        if cpu.dtype in Unsupported.dtypes:
+            raise TypeError(f"mock:0 has no {cpu.dtype}; use float32 there")
         result = Tensor._make_wrapper_subclass(
-            cls,
-            wrapped.shape,
-            strides=wrapped.stride(),
-            storage_offset=wrapped.storage_offset(),
-            dtype=wrapped.dtype,
-            device=MOCK,
+            cls, cpu.shape, strides=cpu.stride(), storage_offset=cpu.storage_offset(), dtype=cpu.dtype, device=MOCK
         )
-        result.wrapped = wrapped
+        result.wrapped = cpu
         return result
 
     def __repr__(self) -> str:

@@ -345,10 +345,7 @@ def test_every_figure_has_an_experiment_and_a_line_in_the_docs():
         (["figure=cameras", "figure.score=energy"], "figure.score=energy: contains no score model"),
         (["figure=toy", "figure.energy=energy", "figure.object=cap"], "the data set has no object 'cap'; did you mean"),
         (["figure=recall", "figure.runs=none"], "runs=none: there is no such folder"),
-        (
-            ["figure=recall", "figure.runs=score"],
-            "no finished runs with several numbers of starts; run `python -m lp_fr",
-        ),
+        (["figure=recall", "figure.runs=score"], "no finished runs with several numbers of starts; run `python"),
         (
             ["figure=failures", "figure.objects=[cup]", "figure.timesteps=[1000]"],
             "this prior has timesteps 0 to 999, got 1000",

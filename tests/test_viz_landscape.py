@@ -101,9 +101,8 @@ def test_without_trajectories_and_truth_there_is_only_the_landscape():
 
 def test_ends_without_starts():
     axes = Figure().add_subplot()
-    draw_map(
-        axes, PoseMap(relief=LANDSCAPE, solved=replace(solved_pair(PATHS, 0), starts=None, trajectories=None)), TRUTH
-    )
+    ends_only = replace(solved_pair(PATHS, 0), starts=None, trajectories=None)
+    draw_map(axes, PoseMap(relief=LANDSCAPE, solved=ends_only), TRUTH)
     assert {round(longitude) for longitude, _ in marks(axes, "o")} == {50, 230} and not lines(axes)
 
 
