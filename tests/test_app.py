@@ -26,7 +26,7 @@ from lp_framework.analysis.confidence import Answer, in_words
 from lp_framework.analysis.fields import Draws
 from lp_framework.analysis.landscapes import Landscape, landscape_grid
 from lp_framework.analysis.pairs import PRIOR_ENERGY, ShownPair, View
-from lp_framework.api import TINY_KNOWS
+from lp_framework.api import TINY_WARNING
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.views import RenderingsData
 from lp_framework.errors import UserError
@@ -272,7 +272,7 @@ def test_the_bundled_prior_is_said_not_to_support_photographs(
     fast = replace(PAPER, solver=Choice("ifusion", {"steps": 1}))
     name = jobs.submit(lambda: bench.estimate(photographs[:2], None, True, fast))
     jobs.result(name)
-    assert any(text.startswith(TINY_KNOWS) for text in jobs.warnings(name))
+    assert any(text.startswith(TINY_WARNING) for text in jobs.warnings(name))
 
 
 def test_one_model_is_in_memory_at_a_time(bench: Workbench) -> None:

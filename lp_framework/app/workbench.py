@@ -25,7 +25,7 @@ from lp_framework.analysis.pairs import (
     with_model_landscape,
     with_prior_energy,
 )
-from lp_framework.api import TINY_KNOWS, load_model, load_prior, load_solver, make_starts, move
+from lp_framework.api import TINY_WARNING, load_model, load_prior, load_solver, make_starts, move
 from lp_framework.app.jobs import Cancelled
 from lp_framework.data.module import PairDataModule
 from lp_framework.data.photographs import read_photographs
@@ -100,7 +100,7 @@ class Workbench:
         trusted = bool(found.answers) and all(answer.verdict == "trust" for answer in found.answers)
         bundled = request.prior.name == "tiny" and self._prior_settings(request.prior).get("path") is None
         if prior is not None and bundled and not trusted:
-            log.warning("%s. For photographs, use the solver 'sharp' or start the app with Zero123.", TINY_KNOWS)
+            log.warning("%s. For photographs, use the solver 'sharp' or start the app with Zero123.", TINY_WARNING)
         shown = [
             pair if len(pair.ends) else _answered(pair, pose.numpy())
             for pair, pose in zip(found.shown, found.relative[1:], strict=True)
