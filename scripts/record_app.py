@@ -37,8 +37,7 @@ def frames(page: Page, address: str) -> list[Image.Image]:
         box = page.locator("#explore-map .nsewdrag").first.bounding_box()
         assert box is not None
         x, y = box["x"] + across * box["width"], box["y"] + down * box["height"]
-        page.mouse.move(x - 5, y - 5)
-        page.mouse.move(x, y)
+        page.mouse.move(x, y)  # once, because Plotly ignores moves in quick succession
         page.wait_for_selector("#explore-map .hoverlayer .hovertext")
         shown.append(shot(page))
         page.mouse.click(x, y)

@@ -263,7 +263,7 @@ def test_an_answer_to_all_photographs_at_once_is_drawn_too(bench: Workbench, pho
     found, pairs = bench.estimate(photographs, None, True, replace(PAPER, solver=fast))
     for pair, relative in zip(pairs, found.relative[1:], strict=True):
         assert np.allclose(pair.ends[pair.chosen], relative)
-        assert map_plot(pair.arrived()).data
+        assert map_plot(pair.finite()).data
 
 
 def test_the_bundled_prior_is_said_not_to_support_photographs(

@@ -110,14 +110,14 @@ def test_a_start_without_a_final_pose_is_dropped():
     solution = Solution(poses, torch.tensor([[1.0, math.nan, 0.5]]), poses.isfinite().all(-1), torch.tensor([2]), cost)
     view = View(Path("a.png"), np.zeros((8, 8, 3), dtype=np.uint8), np.array([0.0, 0.0, 1.5]))
     pair = ShownPair("", "", "", view, view, np.array([0.0, 2.0, 0.0]))
-    found = with_solution(pair, solution, starts, 0).arrived()
+    found = with_solution(pair, solution, starts, 0).finite()
     assert found.start_longitudes() == pytest.approx([0, math.degrees(2)]) and found.chosen == 1
     assert found.rotation_errors == pytest.approx([math.degrees(2), 0], abs=1e-3)
     assert ends_in_words(found) == [("0°", "115° off"), ("115°", "0° off")] and found.energies.tolist() == [1.0, 0.5]
-    own = with_solution(replace(pair, truth=None), solution, starts[:, :2], 0).arrived()
+    own = with_solution(replace(pair, truth=None), solution, starts[:, :2], 0).finite()
     assert own.starts is None and np.isnan(own.rotation_errors).all() and ends_in_words(own) == [("", "")] * 2
     assert own.start_longitudes() == [None, None]
-    lost = with_solution(pair, replace(solution, chosen=torch.tensor([1])), starts, 0).arrived()
+    lost = with_solution(pair, replace(solution, chosen=torch.tensor([1])), starts, 0).finite()
     assert lost.chosen is None and lost.failed and len(lost.ends) == 2
 
 

@@ -95,7 +95,7 @@ class ShownPair:
             return [None] * len(self.ends)
         return (np.rad2deg(self.starts[:, 1]) % 360).tolist()
 
-    def arrived(self) -> ShownPair:
+    def finite(self) -> ShownPair:
         """The pair with only the starts that reached a finite pose."""
         sound = np.isfinite(self.ends).all(axis=-1)
         lost = self.chosen is None or not sound[self.chosen]
@@ -298,7 +298,7 @@ def explained_pair(
     """
     seed, field, views = draws.seed, None, []
     (pair,) = solved_pairs(pairs, with_prior_energy(pairs, [pair], prior, draws, grid), solver, starts, seed)
-    pair = pair.arrived()
+    pair = pair.finite()
     if pair.trajectories is not None:  # the same poses, with unwrapped longitudes
         pair = replace(pair, ends=pair.trajectories[:, -1])
     if len(pair.ends):

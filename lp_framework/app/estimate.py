@@ -219,7 +219,7 @@ def register(app: Dash, jobs: Jobs, bench: Workbench, visitors: Visitors) -> Non
     )
     def draw(place: int | None, landscape: str | None, job: str) -> Any:
         try:
-            pair = jobs.result(job).pairs[place or 0].arrived()
+            pair = jobs.result(job).pairs[place or 0].finite()
         except (UserError, IndexError):
             return no_update, no_update
         if landscape is None or landscape not in pair.landscapes:

@@ -17,7 +17,7 @@ from lp_framework.app import forms
 from lp_framework.app.jobs import Jobs
 from lp_framework.app.workbench import Place, Request, Scene, Workbench
 from lp_framework.errors import UserError
-from lp_framework.report.plots import add_targets, add_way
+from lp_framework.report.plots import add_targets, add_trajectory
 
 TAB = "explore"
 OWN = "two_stage_without_noise"  # the solver whose trajectories are shown at first
@@ -207,8 +207,8 @@ def figures(scene: Scene, landscape: str, place: Place | None) -> tuple[go.Figur
     seen, raised = forms.landscape_plots(scene.pair, landscape)
     for (name, pair), colour in zip(place.solved.items() if place else (), cycle(COLOURS), strict=False):
         path = pair.ends if pair.trajectories is None else pair.trajectories[0]
-        add_way(seen, path, words(name), colour)
-        add_way(raised, path, words(name), colour, relief)
+        add_trajectory(seen, path, words(name), colour)
+        add_trajectory(raised, path, words(name), colour, relief)
     add_targets(seen, relief)
     return seen, raised
 
@@ -244,7 +244,7 @@ def _place(place: Place) -> list[Any]:
 
 def end_of(pair: ShownPair) -> tuple[str, str, str]:
     """Where a solver ends, how far from the truth, and its energy there."""
-    pair = pair.arrived()
+    pair = pair.finite()
     number = pair.chosen
     if number is None:
         return "no pose", "", ""

@@ -127,7 +127,7 @@ class Workbench:
         shown = with_prior_energy(pairs, shown, prior, self.draws)
         shown = with_model_landscape(pairs, shown, model, sigma)
         (pair,) = solved_pairs(pairs, shown, solver, starts.make(pairs, self.seed), self.seed)
-        return Scene(pairs, pair.arrived(), request, sigma)
+        return Scene(pairs, pair.finite(), request, sigma)
 
     @torch.no_grad()
     def place(self, scene: Scene, pose: Sequence[float], solvers: Sequence[str]) -> Place:

@@ -180,7 +180,9 @@ def surface_plot(pair: ShownPair) -> go.Figure:
     return _framed(figure, pair, moving)
 
 
-def add_way(figure: go.Figure, path: NDArray, name: str, colour: str, landscape: Landscape | None = None) -> None:
+def add_trajectory(
+    figure: go.Figure, path: NDArray, name: str, colour: str, landscape: Landscape | None = None
+) -> None:
     """Add a trajectory `[S, 3]`, with a mark at its end, to a map or to the surface of a landscape."""
     along, on_map = (
         (_along_map, _on_map) if landscape is None else (_raised(landscape, f) for f in (_along_map, _on_map))
