@@ -38,6 +38,7 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
     """Write `path`.png (200 dpi) and `path`.pdf (vectors), each atomically; returns both paths."""
     path.parent.mkdir(parents=True, exist_ok=True)
     files = []
+    engine = figure.get_layout_engine()
     for suffix in ("png", "pdf"):
         file = path.with_name(f"{path.name}.{suffix}")
         # Without a date, the same figure gives the same file.
@@ -45,6 +46,8 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
         with written(file) as partial, matplotlib.rc_context(SETTINGS):
             figure.savefig(partial, format=suffix, dpi=200, metadata=metadata)
         files.append(file)
+        figure.set_layout_engine("none")  # the other file has the same layout, which takes as long as drawing
+    figure.set_layout_engine(engine)
     return files
 
 
