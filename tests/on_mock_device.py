@@ -15,6 +15,7 @@ from hydra.core.plugins import Plugins
 from lightning import Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
+from matplotlib.figure import Figure
 from mock_device import MOCK, MockTensor, Syncs, mock_device
 from PIL import Image
 from solver_problems import around, exact_pairs, exact_sets
@@ -42,8 +43,9 @@ PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1"
 
 
 @pytest.fixture(autouse=True)
-def device(request: pytest.FixtureRequest) -> Iterator[None]:
-    """The mock device; without float64, like Apple's GPUs, in tests of commands."""
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The mock device; without float64, like Apple's GPUs, in tests of commands. Figures are saved as empty files."""
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b""))
     with mock_device(double="chosen" not in request.fixturenames):
         yield
 
@@ -170,7 +172,7 @@ class MockAccelerator(CPUAccelerator):
 @pytest.fixture(scope="module")
 def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
     """Runs of a prior, a score model and an energy model trained for one epoch on the CPU."""
-    commands = Commands(tmp_path_factory.mktemp("mock"))
+    commands = Commands(tmp_path_factory.mktemp("mock"), train_views=6, test_views=3)
     energy = ("model=energy", "data.image_size=64")
     for name, settings in (("prior", PRIOR), ("score", ("data.image_size=64",)), ("energy", energy)):
         trained = commands.here(name, "train", "trainer.max_epochs=1", *settings)
@@ -216,6 +218,7 @@ def test_eval_and_its_pictures(commands, chosen, solver, monkeypatch):
         return save_pictures(folder, evaluation, data, result)
 
     monkeypatch.setattr("lp_framework.commands.eval.save_pictures", save)
+    monkeypatch.setattr("lp_framework.analysis.examples.MOST", 2)
     there = commands.here(f"{solver}_there", "eval", *EVALUATION, *SHORT[solver], "pictures=true")
     assert there.status == 0, there.err
     assert there.json()["metrics"] == pytest.approx(here.json()["metrics"], abs=1e-3)
@@ -263,7 +266,7 @@ def test_estimate_and_views(commands, chosen):
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1)
 
 
-AS_SMALL = {"cameras": ("figure.objects=[cup]", "figure.targets=1", "figure.starts=1")}
+AS_SMALL = {"cameras": ("figure.objects=[cup]", "figure.targets=1", "figure.starts=1", "figure.methods=[langevin]")}
 
 
 @pytest.mark.parametrize("name", [name for name in SMALL if name != "recall"])  # which solves nothing
@@ -284,7 +287,8 @@ def test_figures(commands, chosen, name):
 @pytest.mark.parametrize("measure", ["first_stage", "second_stage", "pair"])
 def test_bench(tmp_path, chosen, measure):
     chosen()
-    settings = {**FEW, "second_stage.architecture": "narrow", "second_stage.starts": "[1]", "second_stage.rounds": "1"}
+    narrow = {"second_stage.architecture": "narrow", "second_stage.starts": "[1]", "second_stage.rounds": "1"}
+    settings = {**FEW, **narrow, "pair.steps": "1"}
     small = (f"{key}={value}" for key, value in settings.items())
     ran = Commands(tmp_path, train_views=6).here("bench", "bench", f"measure=[{measure}]", *small)
     assert ran.status == 0, ran.err
