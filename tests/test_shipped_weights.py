@@ -24,8 +24,8 @@ from lp_framework.solvers.base import Pairs
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-# The test views of every object are those of any other protocol; of training views there are four.
-FEW_VIEWS = ("data.latitude_step_degrees=60", "data.longitude_step_degrees=180")
+# The test views of every object are those of any other protocol, and no training view is used.
+FEW_VIEWS = ("data.train_views=1", "data.workers=1")
 
 
 @pytest.fixture(scope="module")
