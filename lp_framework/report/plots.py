@@ -217,7 +217,7 @@ def _pair_cameras_plot(pair: ShownPair) -> go.Figure:
     for name, landscape in pair.landscapes.items():
         latitude, longitude, energy = closed(landscape)
         ball = _ball(np.radians(latitude) + reference[0], np.radians(longitude) + reference[1], GLOBE)
-        shade = {"intensity": _numbers(energy.ravel()), "colorscale": RELIEF, "showscale": False}
+        shade = {"intensity": _objects(_numbers(energy.ravel())), "colorscale": RELIEF, "showscale": False}
         figure.add_mesh3d(**ball, **shade, **_of(pair, name), **look)
     angles = pair.reference.field_of_view, pair.query.field_of_view
     _add_camera(figure, _frustum(reference, distance, angles[0]), pair.reference.image, REFERENCE, 5)
@@ -350,7 +350,7 @@ def _image(frustum: NDArray, image: NDArray, side: int = PIXELS) -> go.Mesh3d:
     points = upper_left + share[:, None] * (lower_left - upper_left) + share * (lower_right - lower_left)
     colours = [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue, _ in pixels[shown]]
     light = {"ambient": 1, "diffuse": 0, "specular": 0, "fresnel": 0}
-    return go.Mesh3d(**_mesh(points, shown), facecolor=colours * 2, hoverinfo="skip", lighting=light)
+    return go.Mesh3d(**_mesh(points, shown), facecolor=_objects(colours * 2), hoverinfo="skip", lighting=light)
 
 
 def _ball(latitude: NDArray, longitude: NDArray, radius: float) -> dict[str, Any]:
@@ -366,7 +366,13 @@ def _mesh(points: NDArray, shown: NDArray) -> dict[str, Any]:
     corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()[shown]
     below = corner + columns + 1
     corners = {"i": (corner, corner + 1), "j": (below, below), "k": (corner + 1, below + 1)}
-    return {**_xyz(points.reshape(-1, 3)), **{name: np.concatenate(both).tolist() for name, both in corners.items()}}
+    values = {**_xyz(points.reshape(-1, 3)), **{name: np.concatenate(both).tolist() for name, both in corners.items()}}
+    return {name: _objects(each) for name, each in values.items()}
+
+
+def _objects(values: list[Any]) -> NDArray[np.object_]:
+    """As an array, which Plotly takes as a whole; lists it checks value by value, and arrays of numbers it packs."""
+    return np.array(values, dtype=object)
 
 
 def _figure(**layout: Any) -> go.Figure:
