@@ -350,6 +350,8 @@ def test_a_long_trajectory_has_few_frames_including_its_last_step(tmp_path):
 )
 def test_a_note_replaces_what_is_missing_or_damaged(kind, file, content, tmp_path):
     folder = WRITERS[kind](tmp_path / "run")
+    if kind == "eval":  # one pair is enough
+        save_examples(folder / "pictures" / EXAMPLES, [example()])
     if content is None:
         (folder / file).unlink()
     else:
@@ -467,6 +469,20 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
     assert wrong == []
 
 
+@pytest.fixture(scope="module")
+def evaluation_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of an evaluation."""
+    return write_run_page(write_evaluation(tmp_path_factory.mktemp("evaluation") / "run"), "eval")
+
+
+@pytest.fixture(scope="module")
+def tables_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same without pictures, which take long to draw."""
+    folder = write_evaluation(tmp_path_factory.mktemp("tables") / "run")
+    shutil.rmtree(folder / "pictures")
+    return write_run_page(folder, "eval")
+
+
 def scroll_through(page: Any) -> None:
     """Down the page, so that every plot in sight is drawn."""
     for place in range(page.locator(".plot").count()):
@@ -482,8 +498,8 @@ def colours(page: Any, selector: str) -> int:
 
 @with_browser
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1200), ("dark", 1200), ("dark", 390)])
-def test_a_page_is_drawn_in_light_and_dark_on_desks_and_phones(scheme, width, opened, tmp_path):
-    page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"), scheme, width)
+def test_a_page_is_drawn_in_light_and_dark_on_desks_and_phones(scheme, width, opened, evaluation_page):
+    page = opened(evaluation_page, scheme, width)
     timing = page.evaluate("performance.getEntriesByType('navigation')[0].loadEventEnd")
     assert timing < 20_000  # milliseconds; under three seconds on a machine that does nothing else
     scroll_through(page)
@@ -500,8 +516,8 @@ def test_a_page_is_drawn_in_light_and_dark_on_desks_and_phones(scheme, width, op
 
 @with_browser
 @pytest.mark.parametrize(("width", "whole"), [(1280, True), (390, False)])
-def test_a_table_shows_all_of_its_columns_or_scrolls_in_its_own_box(width, whole, opened, tmp_path):
-    page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"), "light", width)
+def test_a_table_shows_all_of_its_columns_or_scrolls_in_its_own_box(width, whole, opened, tables_page):
+    page = opened(tables_page, "light", width)
     for name in ("summary", "objects"):
         region = page.get_by_role("region", name=name)
         assert region.evaluate("(box) => box.scrollWidth <= box.clientWidth") == whole
@@ -539,8 +555,8 @@ FRAME = """(step) => [...document.querySelectorAll('.stage:not([hidden]) .plot')
 
 
 @with_browser
-def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tmp_path):
-    page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"))
+def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, evaluation_page):
+    page = opened(evaluation_page, "light", 600)
     scroll_through(page)
     slider = page.get_by_label("solver step").first
     assert slider.input_value() == slider.get_attribute("max") == str(STEPS)
@@ -554,6 +570,7 @@ def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tm
     play = page.locator(".player button").first
     play.evaluate("(button) => { button.click(); button.click(); }")
     assert play.inner_text() == "Play" and slider.input_value() == "4"  # it has stopped where it was
+    slider.fill(str(STEPS - 4))
     play.click()
     page.wait_for_function(f"document.querySelector('.player input').value === '{STEPS}'")
     page.wait_for_function("document.querySelector('.player button').textContent === 'Play'")
@@ -577,8 +594,8 @@ def test_the_slider_plays_the_trajectories_of_the_pair_that_is_chosen(opened, tm
 
 
 @with_browser
-def test_a_table_sorts_by_click_and_by_keyboard(opened, tmp_path):
-    page = opened(write_run_page(write_evaluation(tmp_path / "run"), "eval"))
+def test_a_table_sorts_by_click_and_by_keyboard(opened, tables_page):
+    page = opened(tables_page)
     table = page.get_by_role("region", name="objects").locator("table")
 
     def names() -> list[str]:
