@@ -11,12 +11,14 @@ import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hypothesis import settings
+from omegaconf import OmegaConf
 from tiny_runs import Commands
 
 from lp_framework import cli, registry, torchvision_ops
@@ -30,6 +32,25 @@ settings.load_profile("same")
 for group in registry.GROUPS:  # built-ins register only on first import, which must not be inside `clean_registry`
     for package in registry.GROUPS[group]:
         importlib.import_module(package)
+
+
+def parsed_once(load: Callable[..., Any]) -> Callable[[Any], Any]:
+    """OmegaConf's reader of YAML, which takes a quarter of a command's composition, but once for the same text."""
+    read: dict[str, Any] = {}
+
+    def load_once(file: Any) -> Any:
+        if not hasattr(file, "read"):
+            return load(file)
+        begin, text = file.tell(), file.read()
+        if text not in read:
+            file.seek(begin)
+            read[text] = load(file)
+        return copy.deepcopy(read[text])
+
+    return load_once
+
+
+OmegaConf.load = staticmethod(parsed_once(OmegaConf.load))  # type: ignore[method-assign]
 ROOT = Path(__file__).parents[1]
 collect_ignore = ["mock_device.py", "on_mock_device.py"]  # run in a separate process
 
