@@ -288,7 +288,7 @@ def test_figures(commands, chosen, name):
 def test_bench(tmp_path, chosen, measure):
     chosen()
     narrow = {"second_stage.architecture": "narrow", "second_stage.starts": "[1]", "second_stage.rounds": "1"}
-    settings = {**FEW, **narrow, "pair.steps": "1"}
+    settings = {**FEW, **narrow}
     small = (f"{key}={value}" for key, value in settings.items())
     ran = Commands(tmp_path, train_views=6).here("bench", "bench", f"measure=[{measure}]", *small)
     assert ran.status == 0, ran.err

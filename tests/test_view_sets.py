@@ -164,7 +164,7 @@ def test_a_solver_of_pairs_gives_each_image_the_answer_of_its_pair(commands):
 
 
 def test_the_joint_solver_from_the_command_line(commands):
-    settings = ("checkpoint=./score", "solver=multiview", "views=4", "start=random")
+    settings = ("checkpoint=./score", "solver=multiview", "solver.refinement_steps=10", "views=4", "start=random")
     ran = commands.here("joint", "eval", *settings, "pictures=true")
     assert ran.status == 0, ran.err
     assert ran.json()["pairs"] == len(OBJECTS) * TEST_VIEWS * 3
