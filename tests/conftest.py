@@ -19,7 +19,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hypothesis import settings
 from omegaconf import OmegaConf
-from tiny_runs import Commands
+from tiny_runs import Commands, undrawn
 
 from lp_framework import cli, registry, torchvision_ops
 
@@ -102,6 +102,13 @@ def lp(
         return Finished(status, *capsys.readouterr())
 
     return run
+
+
+@pytest.fixture
+def no_drawing() -> Iterator[None]:
+    """Figures are made, but saved without drawing them, which takes most of a command's time."""
+    with undrawn():
+        yield
 
 
 @pytest.fixture

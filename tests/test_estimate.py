@@ -73,6 +73,13 @@ CONFIDENCE = (
 )  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def figures(request: pytest.FixtureRequest) -> None:
+    """They are drawn for the test that looks at them."""
+    if request.function is not test_every_file_says_the_same:
+        request.getfixturevalue("no_drawing")
+
+
 @pytest.fixture
 def photos(tmp_path: Path, write: Callable[[str, str], Path]) -> Path:
     """A folder with three photographs, darker from one to the next, where the solver above is a plugin."""

@@ -79,7 +79,7 @@ def test_the_summary_of_a_pair_is_that_of_its_arrays(pair):
     assert summary["checkpoint"].endswith("model.safetensors") and summary["seed"] == 0
 
 
-def test_both_stages_on_one_map(commands):
+def test_both_stages_on_one_map(commands, no_drawing):
     ran = commands.here(
         "stages", "landscape", "object=tram", "query=2", "solver=two_stage", "solver.iterations=2",
         "solver.refinement_steps=3", "start=random", "start.count=2", *COARSE,
@@ -88,7 +88,7 @@ def test_both_stages_on_one_map(commands):
     assert arrays(ran)["trajectories"].shape == (2, 2 + 3 + 1, 3)
 
 
-def test_a_pair_of_photographs_has_no_truth(commands):
+def test_a_pair_of_photographs_has_no_truth(commands, no_drawing):
     views = commands.folder / "views" / "tram" / "test" / "rgb"
     ran = commands.here(
         "photographs", "landscape", f"images=[{views / '000.png'},{views / '001.png'}]", "crop=false",

@@ -46,6 +46,13 @@ PRIOR = '''
 '''
 
 
+@pytest.fixture(autouse=True)
+def figures(request):
+    """They are drawn for the test that looks at them."""
+    if request.function is not test_the_picture_shows_the_views_beside_the_source:
+        request.getfixturevalue("no_drawing")
+
+
 @pytest.fixture
 def draw(lp, write, tmp_path):
     """`draw("seed=1")` runs the command with the painter on tiny views; the folder of the run."""

@@ -132,8 +132,8 @@ class Commands:
     def here(self, name: str, command: str, *overrides: str) -> Ran:
         """Run in this process. A training's picture, which other tests are about, is left empty."""
         out, err = io.StringIO(), io.StringIO()
-        undrawn = _undrawn() if command == "train" else contextlib.nullcontext()
-        with _aside(self.folder), undrawn, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        drawing = undrawn() if command == "train" else contextlib.nullcontext()
+        with _aside(self.folder), drawing, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             sys.argv = ["lp", *self.arguments(name, command, *overrides)]
             status = cli.main()
         return Ran(status, out.getvalue(), err.getvalue(), self.folder / name)
@@ -153,7 +153,7 @@ class Commands:
 
 
 @contextlib.contextmanager
-def _undrawn() -> Iterator[None]:
+def undrawn() -> Iterator[None]:
     """Figures are made, but saved without drawing them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).touch())
