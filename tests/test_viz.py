@@ -481,7 +481,8 @@ def test_pictures_of_an_evaluation(data: PairData, tmp_path: Path):
     assert len(kept) == len(names) - 2 and all(each.trajectories is not None for each in kept)
 
 
-def test_the_calibration_of_an_evaluation_with_probabilities(data: PairData, tmp_path: Path):
+def test_the_calibration_of_an_evaluation_with_probabilities(data: PairData, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("lp_framework.commands.eval.gather_examples", lambda *_: [])  # whose pictures take longest
     evaluation = evaluated(Langevin(ScoreModel(Means(), hidden=8, layers=1), iterations=5), data, Ring(4))
     bins = [{"pairs": 3, "probability": 0.2, "right": 0.3}, {"pairs": 9, "probability": 0.9, "right": 0.8}]
     result = {**evaluation.metrics.compute(), "breakdown": {"calibration": {"bins": bins}}}
