@@ -76,7 +76,7 @@ CONFIDENCE = (
 @pytest.fixture(autouse=True)
 def figures(request: pytest.FixtureRequest) -> None:
     """They are drawn for the test that looks at them."""
-    if request.function is not test_every_file_says_the_same:
+    if request.function is not test_all_files_agree:
         request.getfixturevalue("no_drawing")
 
 
