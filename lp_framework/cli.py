@@ -11,7 +11,7 @@ import signal
 import sys
 from typing import NoReturn
 
-from lp_framework.errors import UserError, among
+from lp_framework.errors import UserError, among, printable
 
 COMMANDS = {  # the module of a command is lp_framework.commands.NAME
     "train": "Train a score, energy or matching model of the relative pose, or a prior",
@@ -60,7 +60,7 @@ def main() -> int:
         elif command == "--version":
             print(f"lp_framework {importlib.metadata.version('lp_framework')}")
         elif command not in COMMANDS:
-            print(f"error: there is no command '{command}'{among(command, COMMANDS)}", file=sys.stderr)
+            print(f"error: there is no command '{printable(command)}'{among(command, COMMANDS)}", file=sys.stderr)
             return 2
         elif command == "plugins":
             from lp_framework.commands import plugins
@@ -79,7 +79,7 @@ def main() -> int:
     except UserError as error:
         if full_error:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return error.status
     return 0
 

@@ -42,6 +42,15 @@ def one_line(error: BaseException) -> str:
     return " ".join(line for line in lines if line and not line.startswith(("full_key:", "object_type=", "See https:")))
 
 
+def printable(text: str) -> str:
+    r"""Escape characters that a terminal would act on, such as the `\r` of a command copied from Windows.
+
+    >>> print(printable("cannot read 'seed=1\r'"))
+    cannot read 'seed=1\r'
+    """
+    return "".join(each if each.isprintable() or each == "\n" else repr(each)[1:-1] for each in text)
+
+
 def check_settings(group: str, *settings: tuple[str, object, bool, str]) -> None:
     """Raise `UserError` for the first invalid one of a group's settings (name, value, is valid, what is required).
 

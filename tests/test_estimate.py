@@ -508,7 +508,7 @@ def test_masks_are_made_written_and_shown(lp, tmp_path: Path, monkeypatch: pytes
             mask = np.asarray(file)[30:-30, 30:-30] >= 128
         assert (mask & truth).sum() > 0.9 * (mask | truth).sum()
     page = (tmp_path / "run/report.html").read_text()
-    assert 'alt="mask of a.png"' in page and "The masks are rough ones by GrabCut" in page
+    assert 'alt="mask of a.png"' in page and "The masks are rough, made by GrabCut" in page
     assert abs(float(rows(tmp_path / "run")[1]["relative_longitude_degrees"]) - 60) < 20
     assert json.loads((tmp_path / "run/results.json").read_text())["masks_by"] == "GrabCut"
 
