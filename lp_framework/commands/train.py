@@ -123,8 +123,9 @@ def chosen_logger(settings: Mapping[str, Any], folder: Path) -> list[Logger]:
 
 
 def next_command(settings: Mapping[str, Any], folder: str) -> str:
-    """The command that uses the trained model, on the data it was trained on."""
-    data = settings["data"]
+    """The command that uses the trained model, on the data it was trained on and with the same plugins."""
+    data, folders = settings["data"], ",".join(map(str, settings["plugins"]))
+    plugins = [f"plugins={shlex.quote(f'[{folders}]')}"] if folders else []
     if not issubclass(registry.get("model", settings["model"]["name"]), PoseModel):
         return f"python -m lp_framework views prior.path={folder}"
     usual = catalogue.values("data", data["name"])
@@ -134,7 +135,7 @@ def next_command(settings: Mapping[str, Any], folder: str) -> str:
         if key not in ("name", *TRAIN_ONLY) and value != usual.get(key)
     ]
     chosen = [] if data["name"] == "toy" else [f"data={data['name']}"]
-    return " ".join(["python -m lp_framework eval", f"checkpoint={folder}", *chosen, *changed])
+    return " ".join(["python -m lp_framework eval", *plugins, f"checkpoint={folder}", *chosen, *changed])
 
 
 class MetricsLogger(Logger):
@@ -182,7 +183,7 @@ def report(trainer: Trainer, folder: Path, settings: Mapping[str, Any], data: Pa
     )  # fmt: skip
     if diverged := ", ".join(sorted({*losses} - {*finite})):
         raise UserError(f"{folder}: training diverged (not finite: {diverged}); lower model.learning_rate")
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
     console.print(", ".join(f"{key} {value:.4f}" for key, value in sorted(finite.items())))
     console.print(f"model:   {folder / FOLDER / BEST}")
     for picture in save_training_picture(folder):
