@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,8 @@ from view_folders import draw_view
 from lp_framework import registry
 from lp_framework.errors import UserError
 from lp_framework.geometry import view_pose
+from lp_framework.models.backbones import EfficientNetLite0
+from lp_framework.models.pose_model import ScoreModel
 from lp_framework.priors.base import Prior
 from lp_framework.solvers.base import Pairs
 
@@ -43,6 +47,23 @@ def test_pattern_search_solves_each_pair_of_a_batch_as_if_alone():
     whole = solver.solve(pairs, starts, seed=0)
     alone = solver.solve(some(pairs, torch.tensor([1])), starts[1:2], seed=0)
     torch.testing.assert_close(alone.poses, whole.poses[1:2])
+
+
+# ---------------------------------------------------------------- the model
+
+
+def test_the_robust_loss_is_quadratic_near_zero_and_linear_far_away():
+    backbone = EfficientNetLite0(hidden=8, features=4)
+    score = ScoreModel(backbone, hidden=8)
+    true = torch.tensor([[0.1, 1.0, 0.0], [0.0, 4.0, 0.2]])
+    noised, condition = true + torch.tensor([0.2, -0.5, 0.1]), torch.randn(2, 8)
+    squared = score.pair_loss(condition, noised, true)  # 1/2 |e|^2
+    for delta, expected in ((30.0, squared), (1e-4, 1e-4 * (2 * squared).sqrt())):
+        robust = registry.build("model", {"name": "robust_score", "delta": delta, "hidden": 8}, backbone=backbone)
+        robust.network = score.network
+        torch.testing.assert_close(robust.pair_loss(condition, noised, true), expected, rtol=1e-2, atol=1e-6)
+    with pytest.raises(UserError, match=r"model\.delta must be positive, got 0"):
+        registry.build("model", {"name": "robust_score", "delta": 0.0}, backbone=backbone)
 
 
 # ---------------------------------------------------------------- the prior
@@ -115,11 +136,11 @@ def turntable(tmp_path):
     """Eight photographs of a mug, 45 degrees apart."""
     from PIL import Image
 
-    (tmp_path / "mug").mkdir()
+    (tmp_path / "objects" / "mug").mkdir(parents=True)
     for index in range(8):
         pose = torch.tensor([0.2, index * math.pi / 4, 1.5]).numpy()
-        Image.fromarray(draw_view(pose, 32)).save(tmp_path / "mug" / f"{index:03d}.png")
-    return tmp_path
+        Image.fromarray(draw_view(pose, 32)).save(tmp_path / "objects" / "mug" / f"{index:03d}.png")
+    return tmp_path / "objects"
 
 
 def test_the_turntable_knows_its_cameras(turntable):
@@ -138,9 +159,15 @@ def test_the_turntable_names_an_object_with_too_few_photographs(turntable):
         source.views("mug", "test")
 
 
-def test_all_three_can_be_chosen_on_the_command_line(lp, turntable):
-    plugins = f"plugins=[{EXAMPLES}]"
-    choices = ("data=turntable", f"data.path={turntable}", "prior=cylinder", "solver=pattern_search", "start=ring")
-    finished = lp("eval", plugins, *choices, "pictures=false", "hydra.run.dir=run", "solver.steps=3")
+def test_all_can_be_chosen_on_the_command_line(lp, turntable):
+    plugins, data = f"plugins=[{EXAMPLES}]", ("data=turntable", f"data.path={turntable}")
+    small = ("data.validation_views=2", "data.image_size=32", "trainer.max_epochs=1")
+    trained = lp("train", plugins, *data, *small, "model=robust_score", "model.delta=0.2", "hydra.run.dir=trained")
+    assert trained.status == 0, trained.err
+    (following,) = re.findall(r"next: +python -m lp_framework (.*)", trained.out)
+    first = lp(*shlex.split(following), "solver=langevin", "pictures=false", "hydra.run.dir=first")
+    assert first.status == 0, first.err
+    choices = ("prior=cylinder", "solver=pattern_search", "start=ring", "solver.steps=3")
+    finished = lp("eval", plugins, *data, *choices, "pictures=false", "hydra.run.dir=run")
     assert finished.status == 0, finished.err
     assert "turntable, pattern_search, start=ring, 2 pairs" in finished.out
