@@ -249,8 +249,8 @@ def _output_digest(extractor: FeatureExtractor, size: int) -> list[str]:
 
 
 def _extracted(extractor: FeatureExtractor, images: NDArray, device: torch.device) -> Iterator[NDArray]:
-    """Features `[n, ...]` of consecutive images. On a CPU, threads take one image each: faster than sharing the work
-    of each layer, and the results do not depend on the number of threads."""
+    """Features `[n, ...]` of consecutive images. On a CPU, each thread computes whole images, so the results do not
+    depend on the number of threads."""
     count, workers = (1, cores()) if device.type == "cpu" else (256, 1)
     extractor.to(device)  # not in inference mode: parameters moved there can no longer be trained
 
@@ -261,7 +261,9 @@ def _extracted(extractor: FeatureExtractor, images: NDArray, device: torch.devic
         return found
 
     threads, ahead = torch.get_num_threads(), 8 * workers * count
-    with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        for start in tracked(range(0, len(images), ahead), "computing features"):
-            yield from pool.map(features, range(start, min(start + ahead, len(images)), count))
-    torch.set_num_threads(threads)  # the workers have set PyTorch's default for new threads, too
+    try:
+        with ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            for start in tracked(range(0, len(images), ahead), "computing features"):
+                yield from pool.map(features, range(start, min(start + ahead, len(images)), count))
+    finally:
+        torch.set_num_threads(threads)  # the workers have also set PyTorch's default for new threads
