@@ -35,9 +35,7 @@ BACKGROUNDS = {
     "cut": "Cut out the object: by its mask, else by transparency, else automatically",
     "white": "Use the images as they are: square, with the object on white",
 }
-NEARLY_AS_DEEP = (
-    0.1  # of the landscape's range: warn of a second minimum whose energy is at most this much above the lowest
-)
+NEARLY_AS_DEEP = 0.1  # of the landscape's range: warn of a second minimum at most this much above the lowest one
 
 
 class Result(NamedTuple):
