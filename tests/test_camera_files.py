@@ -309,9 +309,8 @@ def test_the_camera_of_a_crop_projects_any_object_onto_its_photograph(name: str)
     depth = -np.linalg.inv(truth.matrix)[2, 3]  # of the object's centre
     centre = truth.matrix[:3, :3] @ [depth * math.tan(across.mean()), -depth * math.tan(down.mean()), -depth]
     centre = centre + truth.matrix[:3, 3]
-    crop = truth._replace(
-        matrix=rigid_transform(*map(torch.from_numpy, (truth.matrix[:3, :3], truth.matrix[:3, 3] - centre))).numpy()
-    )
+    crop = truth._replace(matrix=truth.matrix.copy())  # relative to that point
+    crop.matrix[:3, 3] -= centre
     ball = depth * math.sin(half) / math.cos(middle)
     camera = photograph_camera("a.png", pose_of(crop, FILLING * ball / 0.5), (SIDE, SIDE), box, truth.focal, DEGREES)
     error = camera.pixels(points - centre) - truth.pixels(points)
