@@ -15,14 +15,13 @@ from hydra.core.plugins import Plugins
 from lightning import Trainer
 from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
-from matplotlib.figure import Figure
 from mock_device import MOCK, MockTensor, Syncs, mock_device
 from PIL import Image
 from solver_problems import around, exact_pairs, exact_sets
 from test_bench import FEW
 from test_figures import SMALL
 from test_solver_contract import SOLVERS, build
-from tiny_runs import Commands
+from tiny_runs import Commands, undrawn
 
 from lp_framework import api, load_prior, registry
 from lp_framework.benchmarks.zero123 import NARROW, random_pair
@@ -43,10 +42,9 @@ PRIOR = ("model=prior", "model.latent_dim=6", "model.width=16", "model.layers=1"
 
 
 @pytest.fixture(autouse=True)
-def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def device(request: pytest.FixtureRequest) -> Iterator[None]:
     """The mock device; without float64, like Apple's GPUs, in tests of commands. Figures are saved as empty files."""
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b""))
-    with mock_device(double="chosen" not in request.fixturenames):
+    with undrawn(), mock_device(double="chosen" not in request.fixturenames):
         yield
 
 
