@@ -24,6 +24,7 @@ from torch import Tensor
 
 from lp_framework.atomic import written
 from lp_framework.data.masks import HALF
+from lp_framework.data.outlines import convex_outline, match_outlines
 from lp_framework.data.photographs import EXTENT, SIZE, Box, Photograph, Prepared, exif_focal, on_white, save_upright
 from lp_framework.geometry import camera_to_world, from_opencv, inverse, level_camera, to_ifusion
 
@@ -202,6 +203,20 @@ def original_focal_length(
     return (ASSUMED_FOCAL * max(size), ASSUMED) if told is None else (told, "EXIF")
 
 
+def match_originals(cameras: Sequence[Camera], prepared: Sequence[Prepared]) -> list[Camera]:
+    """Shift the cameras of cropped photographs until the object's outlines match, see `match_outlines`."""
+    rays = []
+    for camera, (image, box) in zip(cameras, prepared, strict=True):
+        assert box is not None
+        left, top, right, bottom = box
+        crop = convex_outline(np.asarray(image)[..., 3] >= HALF) - SIZE / 2  # pixels from the middle of the box
+        pixels = crop * max(right - left, bottom - top) / EXTENT + [(left + right) / 2, (top + bottom) / 2]
+        across, down = ((pixels - [camera.width / 2, camera.height / 2]) / camera.focal).T
+        rays.append(np.stack([across, -down, -np.ones(len(pixels))], axis=-1))
+    matrices = match_outlines(np.stack([camera.matrix for camera in cameras]), rays)
+    return [camera._replace(matrix=matrix) for camera, matrix in zip(cameras, matrices, strict=True)]
+
+
 def export_cameras(
     folder: Path, photographs: Mapping[int, tuple[Photograph, Prepared]], poses: Tensor, field_of_view_degrees: float
 ) -> None:
@@ -219,6 +234,8 @@ def export_cameras(
         focal, _ = original_focal_length(photograph, prepared, field_of_view_degrees)
         size = photograph.image.size
         originals.append(photograph_camera(copy, pose, size, prepared.box, focal, field_of_view_degrees))
+    if all(prepared.box is not None for _, prepared in photographs.values()):
+        originals = match_originals(originals, [prepared for _, prepared in photographs.values()])
     write_cameras(folder / ORIGINAL, originals, points)
     scene = camera_scene(views, images, [f"{number} {file.name}" for number, file in files.items()])
     with written(folder / "cameras.glb") as partial:
