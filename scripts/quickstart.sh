@@ -6,6 +6,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 bash scripts/setup.sh ""  # without the test dependencies
 python=.venv/bin/python
+# The first command compiles PyTorch's bytecode first; meanwhile another core compiles the modules that it imports next.
+$python -c "import hydra.main, scipy.signal, scipy.spatial, trimesh, plotly.offline, matplotlib.pyplot" &
 echo "quickstart: estimating where the camera went between two pictures of a can that the model has never met"
 $python -m lp_framework estimate "images=[docs/pictures/example_0.png,docs/pictures/example_1.png]" \
     hydra.run.dir=runs/quickstart_estimate
@@ -19,8 +21,6 @@ elif [ -f "$run/checkpoints/last.ckpt" ] && [ $# -eq 0 ]; then
 else
     echo "quickstart: rendering the embedded objects and training (about 5 minutes on 2 cores)"
     rm -rf "$run"
-    # Training compiles PyTorch's bytecode first; meanwhile another core compiles the modules that it imports next.
-    $python -c "import hydra.main, scipy.spatial, trimesh, plotly.offline, matplotlib.pyplot" &
     $python -m lp_framework train "hydra.run.dir=$run" logger=csv "$@"
 fi
 echo

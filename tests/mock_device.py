@@ -7,14 +7,13 @@ Importing this module registers PyTorch's third-party device for the whole proce
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
 
@@ -105,7 +104,7 @@ class _Mode(TorchDispatchMode):
 
 def _compute(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """Run an operation whose tensors are all on the same device."""
-    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+    tensors = [*_tensors(args), *_tensors(kwargs.values())]
     # In inference mode, PyTorch has not decomposed composite operations yet.
     if torch.is_inference_mode_enabled() or any(each.is_inference() for each in tensors):
         with _Mode():
@@ -121,20 +120,41 @@ def _compute(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     to_cpu = operator is aten._to_copy.default and requested not in (None, MOCK.type)
     to_mock = operator in COPIES and bool(on_cpu) and not kwargs.get("non_blocking")
     Syncs.count += operator is aten._local_scalar_dense.default or to_cpu or to_mock
-    result = EAGER.get(operator, operator)(*tree_map(_unwrapped, args), **tree_map(_unwrapped, kwargs))
+    named = {name: _unwrapped(each) for name, each in kwargs.items()}
+    result = EAGER.get(operator, operator)(*map(_unwrapped, args), **named)
     if to_cpu:
         return result
     if operator is aten.copy_.default:
         return args[0]
     known = {id(each.wrapped): each for each in on_mock}  # in-place operations return their argument
-    return tree_map(lambda leaf: known.get(id(leaf), MockTensor(leaf)) if isinstance(leaf, Tensor) else leaf, result)
+    return _wrapped(result, known)
 
 
-def _unwrapped(leaf: object) -> object:
+def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
+    """The tensors among arguments and in lists of them; PyTorch's pytrees would take most of the time."""
+    for each in values:
+        if isinstance(each, Tensor):
+            yield each
+        elif isinstance(each, (list, tuple)):
+            yield from _tensors(each)
+
+
+def _unwrapped(value: Any) -> Any:
     """The CPU version of an argument."""
-    if isinstance(leaf, torch.device) and leaf.type == MOCK.type:
-        return torch.device("cpu")
-    return leaf.wrapped if isinstance(leaf, MockTensor) else leaf
+    if isinstance(value, MockTensor):
+        return value.wrapped
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(_unwrapped, value))
+    return torch.device("cpu") if isinstance(value, torch.device) and value.type == MOCK.type else value
+
+
+def _wrapped(value: Any, known: dict[int, MockTensor]) -> Any:
+    """The mock version of a result."""
+    if isinstance(value, (list, tuple)):
+        return type(value)(_wrapped(each, known) for each in value)
+    if isinstance(value, Tensor):
+        return known[id(value)] if id(value) in known else MockTensor(value)
+    return value
 
 
 # ---------------------------------------------------------------- kernels that PyTorch calls outside of any mode

@@ -25,7 +25,7 @@ from lp_framework.solvers.base import Pairs
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 # The test views of every object are those of any other protocol, and no training view is used.
-FEW_VIEWS = ("data.train_views=1", "data.workers=1")
+FEW_VIEWS = ("data.train_views=1", "data.test_views=5", "data.workers=1")
 
 
 @pytest.fixture(scope="module")
