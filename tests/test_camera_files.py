@@ -21,6 +21,7 @@ from view_folders import FIELD_OF_VIEW, draw_view, random_poses
 
 from lp_framework.data.camera_files import (
     Camera,
+    Crop,
     camera_scene,
     colmap_model,
     export_cameras,
@@ -202,7 +203,7 @@ def test_seed_points_lie_on_the_hull_and_have_the_colours_of_the_images():
     pixels = RaycastRenderer().render(trimesh.Scene(ball(0.4)), camera_to_world(poses), 128, DEGREES)
     cameras = view_cameras(NAMES[: len(poses)], poses, 128, DEGREES)
     images = [Image.fromarray(each) for each in pixels]
-    points = seed_points(cameras, images)
+    points = seed_points(cameras, images, [Crop(np.array([64.0, 64.0]), 1.0)] * len(images))
     distance = np.linalg.norm(points.vertices, axis=1)
     assert len(distance) > 1000 and distance.min() > 0.36 and np.median(distance) < 0.44  # five views leave corners
     for camera, image in zip(cameras, images, strict=True):
@@ -221,7 +222,8 @@ def test_there_are_seed_points_where_masks_leave_nothing(kind: str):
         halves = np.zeros((2, 256, 256, 4), np.uint8)
         halves[0, :100], halves[1, -100:] = (200, 10, 30, 255), (200, 10, 30, 255)
         images = [Image.fromarray(half) for half in halves]
-    points = seed_points(view_cameras(["a", "b"], torch.tensor([[0, 0, 1.4], [0, 1.5, 1.4]]), 256, DEGREES), images)
+    cameras = view_cameras(["a", "b"], torch.tensor([[0, 0, 1.4], [0, 1.5, 1.4]]), 256, DEGREES)
+    points = seed_points(cameras, images, [Crop.to(None, (256, 256))] * 2)
     assert len(points.vertices) > 1000 and np.linalg.norm(points.vertices, axis=1).max() < 1
     assert (points.colors[:, :3] == [200, 10, 30]).all(axis=1).mean() > 0.1
 
@@ -360,6 +362,10 @@ def test_any_object_is_projected_onto_all_photographs_it_was_cropped_from(
         for (_, prepared), pose in zip(photographs.values(), poses, strict=True)
     ]
     assert error.mean() < 0.5 * similarity(unmatched, points, seen).mean()
+    hull = trimesh.load(tmp_path / "out" / "original" / "sparse_pc.ply").vertices
+    for camera, pixels in zip(written, seen, strict=True):  # the visual hull is as large as the object everywhere
+        np.testing.assert_allclose(camera.pixels(hull).min(axis=0), pixels.min(axis=0), atol=12)
+        np.testing.assert_allclose(camera.pixels(hull).max(axis=0), pixels.max(axis=0), atol=12)
 
 
 def test_a_view_taken_whole_has_the_camera_of_its_photograph():

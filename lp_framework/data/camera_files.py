@@ -134,18 +134,36 @@ def colmap_model(cameras: Sequence[Camera], points: trimesh.PointCloud) -> dict[
     return {name: "\n".join(content) + "\n" for name, content in contents.items()}
 
 
-def seed_points(cameras: Sequence[Camera], images: Sequence[Image.Image]) -> trimesh.PointCloud:
-    """Points to initialize a reconstruction: the surface of the visual hull, carved by the opacity of RGBA images from
-    a ball around the origin, or the whole ball if almost nothing remains. A point has its colour in the nearest
-    camera's image."""
+class Crop(NamedTuple):
+    """Where a prepared image lies in a camera's image: its middle, and how many pixels wide one of its pixels is."""
+
+    middle: NDArray[np.float64]
+    scale: float
+
+    @classmethod
+    def to(cls, box: Box | None, size: tuple[int, int]) -> Crop:
+        """The crop of an image of `size` (width, height) to an object's bounding box; without a box, all of it."""
+        if box is None:
+            return cls(np.array(size) / 2, size[0] / SIZE)
+        left, top, right, bottom = box
+        return cls(np.array([left + right, top + bottom]) / 2, max(right - left, bottom - top) / EXTENT)
+
+
+def seed_points(cameras: Sequence[Camera], images: Sequence[Image.Image], crops: Sequence[Crop]) -> trimesh.PointCloud:
+    """Points to initialize a reconstruction: the surface of the visual hull, carved by the opacity of RGBA images, the
+    `crops` of what the cameras see, from a ball around the origin; the whole ball if almost nothing remains. A point
+    has its colour in the nearest camera's image."""
     centres = np.stack([camera.matrix[:3, 3] for camera in cameras])
-    reach = REACH * float(np.linalg.norm(centres[0])) * cameras[0].width / 2 / cameras[0].focal
+    half = images[0].width / 2 * crops[0].scale  # pixels
+    reach = REACH * float(np.linalg.norm(centres[0])) * half / cameras[0].focal
     steps = reach * ((np.arange(CELLS) + 0.5) * 2 / CELLS - 1)
     points = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     ball = np.linalg.norm(points, axis=1) < reach
     hull, colours = ball, []
-    for camera, image in zip(cameras, images, strict=True):
-        column, row = camera.pixels(points).clip(0, np.array(image.size) - 1).astype(int).T  # outside: the edge's value
+    for camera, image, crop in zip(cameras, images, crops, strict=True):
+        size = np.array(image.size)
+        pixels = (camera.pixels(points) - crop.middle) / crop.scale + size / 2
+        column, row = pixels.clip(0, size - 1).astype(int).T  # outside: the edge's value
         hull = hull & (np.asarray(image)[row, column, 3] >= HALF)
         colours.append(on_white(image)[row, column])
     solid = hull.reshape(CELLS, CELLS, CELLS)
@@ -203,14 +221,11 @@ def original_focal_length(
     return (ASSUMED_FOCAL * max(size), ASSUMED) if told is None else (told, "EXIF")
 
 
-def match_originals(cameras: Sequence[Camera], prepared: Sequence[Prepared]) -> list[Camera]:
-    """Shift the cameras of cropped photographs until the object's outlines match, see `match_outlines`."""
+def match_cameras(cameras: Sequence[Camera], images: Sequence[Image.Image], crops: Sequence[Crop]) -> list[Camera]:
+    """Shift cameras until the object's outlines in crops of their images match, see `match_outlines`."""
     rays = []
-    for camera, (image, box) in zip(cameras, prepared, strict=True):
-        assert box is not None
-        left, top, right, bottom = box
-        crop = convex_outline(np.asarray(image)[..., 3] >= HALF) - SIZE / 2  # pixels from the middle of the box
-        pixels = crop * max(right - left, bottom - top) / EXTENT + [(left + right) / 2, (top + bottom) / 2]
+    for camera, image, crop in zip(cameras, images, crops, strict=True):
+        pixels = (convex_outline(np.asarray(image)[..., 3] >= HALF) - SIZE / 2) * crop.scale + crop.middle
         across, down = ((pixels - [camera.width / 2, camera.height / 2]) / camera.focal).T
         rays.append(np.stack([across, -down, -np.ones(len(pixels))], axis=-1))
     matrices = match_outlines(np.stack([camera.matrix for camera in cameras]), rays)
@@ -221,12 +236,12 @@ def export_cameras(
     folder: Path, photographs: Mapping[int, tuple[Photograph, Prepared]], poses: Tensor, field_of_view_degrees: float
 ) -> None:
     """Write the cameras of numbered photographs with view poses `[V, 3]`: for the prepared images in `folder/images`,
-    for copies of the photographs in `folder/original`, and as `cameras.glb`."""
+    for copies of the photographs in `folder/original`, and as `cameras.glb`. The cameras of crops are shifted until the
+    object's outlines match."""
     files = {number: Path(photograph.name) for number, (photograph, _) in photographs.items()}
     images = [prepared.image for _, prepared in photographs.values()]
     views = view_cameras([f"images/{number:03d}.png" for number in files], poses, SIZE, field_of_view_degrees)
-    points, originals = seed_points(views, images), []
-    write_cameras(folder, views, points, poses)
+    originals, crops = [], []
     (folder / ORIGINAL / "images").mkdir(parents=True, exist_ok=True)
     for (number, (photograph, prepared)), pose in zip(photographs.items(), poses, strict=True):
         copy = f"images/{number:03d}{files[number].suffix.lower()}"
@@ -234,9 +249,12 @@ def export_cameras(
         focal, _ = original_focal_length(photograph, prepared, field_of_view_degrees)
         size = photograph.image.size
         originals.append(photograph_camera(copy, pose, size, prepared.box, focal, field_of_view_degrees))
+        crops.append(Crop.to(prepared.box, size))
+    whole = [Crop.to(None, image.size) for image in images]
     if all(prepared.box is not None for _, prepared in photographs.values()):
-        originals = match_originals(originals, [prepared for _, prepared in photographs.values()])
-    write_cameras(folder / ORIGINAL, originals, points)
+        views, originals = match_cameras(views, images, whole), match_cameras(originals, images, crops)
+    write_cameras(folder, views, seed_points(views, images, whole), poses)
+    write_cameras(folder / ORIGINAL, originals, seed_points(originals, images, crops))
     scene = camera_scene(views, images, [f"{number} {file.name}" for number, file in files.items()])
     with written(folder / "cameras.glb") as partial:
         partial.write_bytes(scene.export(file_type="glb"))
