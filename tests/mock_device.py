@@ -105,16 +105,17 @@ class _Mode(TorchDispatchMode):
 def _compute(operator: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
     """Run an operation whose tensors are all on the same device."""
     tensors = [*_tensors(args), *_tensors(kwargs.values())]
+    on_mock = [each for each in tensors if isinstance(each, MockTensor)]
+    requested = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
+    if not on_mock and requested != MOCK.type:
+        return operator(*args, **kwargs)
     # In inference mode, PyTorch has not decomposed composite operations yet.
     if torch.is_inference_mode_enabled() or any(each.is_inference() for each in tensors):
         with _Mode():
             result = operator.decompose(*args, **kwargs)
         if result is not NotImplemented:
             return result
-    on_mock, on_cpu = ([each for each in tensors if isinstance(each, MockTensor) == there] for there in (True, False))
-    requested = None if kwargs.get("device") is None else torch.device(kwargs["device"]).type
-    if not on_mock and requested != MOCK.type:
-        return operator(*args, **kwargs)
+    on_cpu = [each for each in tensors if not isinstance(each, MockTensor)]
     if on_mock and operator not in COPIES | INDEXING and any(each.ndim for each in on_cpu):  # CPU scalars are allowed
         raise RuntimeError(f"{operator}: expected all tensors to be on the same device, but found mock:0 and cpu")
     to_cpu = operator is aten._to_copy.default and requested not in (None, MOCK.type)
