@@ -71,6 +71,12 @@ class Finished:
         return lines[0].removeprefix("error: ")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run modules with heavy tests first: short tests at the end keep all test processes busy until then."""
+    heavy = {item.path for item in items if item.get_closest_marker("heavy")}
+    items.sort(key=lambda item: item.path not in heavy)
+
+
 @pytest.fixture
 def clean_registry(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Undo what a test registers or discovers."""

@@ -14,6 +14,7 @@ from torch.utils import backend_registration
 CHECKS = Path(__file__).with_name("on_mock_device.py")
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(
     not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
     reason="this PyTorch does not support devices written in Python",
