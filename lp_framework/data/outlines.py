@@ -17,6 +17,7 @@ from scipy.spatial import ConvexHull
 CORNERS = 64  # of an outline's convex hull
 WIDEST = 2.5  # radians between the two touching planes of a pair; at pi they coincide, and nothing can be compared
 NEAREST = 0.05  # distance between two cameras, relative to their distance from the object
+MOST_PAIRS = 500  # of cameras that are compared; with many cameras, more pairs only cost time
 LARGEST = 0.2  # shift; larger ones mean that the rotations are wrong
 REGULARIZATION = 0.1  # weight of the shifts, which determines what the outlines leave open
 
@@ -60,7 +61,9 @@ def match_outlines(cameras: NDArray[np.float64], rays: Sequence[NDArray[np.float
 
     start = cameras[:, :3, 3]
     apart = np.linalg.norm(start[second] - start[first], axis=-1) > NEAREST * np.linalg.norm(start[first], axis=-1)
-    kept = apart & (np.ptp(planes(start), axis=-1).max(axis=-1) < WIDEST)
+    usable = apart & (np.ptp(planes(start), axis=-1).max(axis=-1) < WIDEST)
+    kept = np.flatnonzero(usable)
+    kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), MOST_PAIRS)).round().astype(int)]
     first, second = first[kept], second[kept]
     result = cameras.copy()
     found = least_squares(residuals, np.zeros(3 * len(cameras)), bounds=(-LARGEST, LARGEST), x_scale=0.05)
