@@ -21,14 +21,14 @@ def cameras_of(*degrees: tuple[float, float]) -> NDArray[np.float64]:
     return camera_to_world(poses).numpy()
 
 
-def outlines(cameras: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def outlines(cameras: NDArray[np.float64]) -> NDArray[np.float64]:
     rays = []
     for camera in cameras:
         seen = (POINTS - camera[:3, 3]) @ camera[:3, :3]
         seen = seen / -seen[:, 2:]
         hull = ConvexHull(seen[:, :2]).vertices
         rays.append(seen[hull[np.linspace(0, len(hull) - 1, CORNERS).round().astype(int)]])
-    return rays
+    return np.stack(rays)
 
 
 def shifted(cameras: NDArray[np.float64], size: float) -> NDArray[np.float64]:
@@ -68,7 +68,7 @@ def test_a_single_the_same_and_opposite_cameras_stay(places: list[tuple[float, f
 
 def test_outlines_that_cannot_match_move_cameras_by_a_bounded_amount():
     cameras = cameras_of((10, 0), (20, 60), (0, 150))
-    wrong = [rays * scale for rays, scale in zip(outlines(cameras), ([3, 3, 1], [1, 1, 1], [0.2, 0.2, 1]), strict=True)]
+    wrong = outlines(cameras) * [[[3, 3, 1]], [[1, 1, 1]], [[0.2, 0.2, 1]]]
     moved = np.linalg.norm((match_outlines(cameras, wrong) - cameras)[:, :3, 3], axis=-1)
     assert np.isfinite(moved).all() and moved.max() < 2.0 * 3 * LARGEST
 

@@ -228,7 +228,7 @@ def match_cameras(cameras: Sequence[Camera], images: Sequence[Image.Image], crop
         pixels = (convex_outline(np.asarray(image)[..., 3] >= HALF) - SIZE / 2) * crop.scale + crop.middle
         across, down = ((pixels - [camera.width / 2, camera.height / 2]) / camera.focal).T
         rays.append(np.stack([across, -down, -np.ones(len(pixels))], axis=-1))
-    matrices = match_outlines(np.stack([camera.matrix for camera in cameras]), rays)
+    matrices = match_outlines(np.stack([camera.matrix for camera in cameras]), np.stack(rays))
     return [camera._replace(matrix=matrix) for camera, matrix in zip(cameras, matrices, strict=True)]
 
 

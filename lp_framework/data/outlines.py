@@ -7,12 +7,11 @@ Wong & Cipolla, Structure and Motion from Silhouettes, 2001), and this determine
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
+from trimesh.util import unitize
 
 CORNERS = 64  # of an outline's convex hull
 WIDEST = 2.5  # radians between the two touching planes of a pair; at pi they coincide, and nothing can be compared
@@ -30,46 +29,51 @@ def convex_outline(opaque: NDArray[np.bool_]) -> NDArray[np.float64]:
     return hull[np.linspace(0, len(hull) - 1, CORNERS).round().astype(int)]
 
 
-def match_outlines(cameras: NDArray[np.float64], rays: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def match_outlines(cameras: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shift cameras to world `[V, 4, 4]` (OpenGL axes), which look at an object around the origin, until its outlines
-    match; rotations stay. `rays` `[V, CORNERS, 3]` point from each camera, in its axes, to the corners of the outline.
+    match; rotations stay. `rays` `[V, K, 3]` point from each camera, in its axes, to K corners of the outline.
 
     A shift moves a camera in its image plane and changes its distance, each by up to `LARGEST` of the distance. What
     the outlines leave open, above all the position of the object as a whole, stays as close as possible.
     """
-    rotations, directions = cameras[:, :3, :3], np.einsum("vij,vkj->vki", cameras[:, :3, :3], np.stack(rays))
+    rotations, directions = cameras[:, :3, :3], np.einsum("vij,vkj->vki", cameras[:, :3, :3], rays)
     origins = -np.einsum("vji,vj->vi", rotations, cameras[:, :3, 3])  # in the cameras' axes
-    first, second = np.triu_indices(len(cameras), k=1)
+    pairs = _comparable_pairs(cameras[:, :3, 3], directions)
 
     def positions(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
         sideways, distance = np.split(shifts.reshape(-1, 3), [2], axis=1)
         moved = (origins - origins[:, 2:] * np.pad(sideways, ((0, 0), (0, 1)))) * np.exp(distance)
         return -np.einsum("vij,vj->vi", rotations, moved)
 
-    def planes(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Angles `[P, 2 (images), 2 (sides)]` of the touching planes about each pair's baseline, from the origin."""
-        baseline = _unit(centres[second] - centres[first])
-        inward = _unit((centres[first] * baseline).sum(axis=-1, keepdims=True) * baseline - centres[first])
-        axes = np.stack([inward, np.cross(baseline, inward)], axis=-1)
-        towards, across = np.moveaxis(directions[np.stack([first, second], axis=1)] @ axes[:, None], -1, 0)
-        angles = np.arctan2(across, towards)
-        return np.stack([angles.min(axis=-1), angles.max(axis=-1)], axis=-1)
-
     def residuals(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-        sides = planes(positions(shifts))
+        sides = _touching_planes(positions(shifts), directions, pairs)
         return np.concatenate([(sides[:, 0] - sides[:, 1]).ravel(), REGULARIZATION * shifts])
 
-    start = cameras[:, :3, 3]
-    apart = np.linalg.norm(start[second] - start[first], axis=-1) > NEAREST * np.linalg.norm(start[first], axis=-1)
-    usable = apart & (np.ptp(planes(start), axis=-1).max(axis=-1) < WIDEST)
-    kept = np.flatnonzero(usable)
-    kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), MOST_PAIRS)).round().astype(int)]
-    first, second = first[kept], second[kept]
-    result = cameras.copy()
     found = least_squares(residuals, np.zeros(3 * len(cameras)), bounds=(-LARGEST, LARGEST), x_scale=0.05)
+    result = cameras.copy()
     result[:, :3, 3] = positions(found.x)
     return result
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+def _touching_planes(
+    centres: NDArray[np.float64], directions: NDArray[np.float64], pairs: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """The planes through pairs `[P, 2]` of cameras at `centres` `[V, 3]` that touch the outlines with `directions`
+    `[V, K, 3]`: angles `[P, 2 (images), 2 (sides)]` about the baseline, 0 through the origin."""
+    first, second = centres[pairs.T]
+    baseline = unitize(second - first)
+    inward = unitize((first * baseline).sum(axis=-1, keepdims=True) * baseline - first)
+    axes = np.stack([inward, np.cross(baseline, inward)], axis=-1)
+    towards, across = np.moveaxis(directions[pairs] @ axes[:, None], -1, 0)
+    angles = np.arctan2(across, towards)
+    return np.stack([angles.min(axis=-1), angles.max(axis=-1)], axis=-1)
+
+
+def _comparable_pairs(centres: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Up to `MOST_PAIRS` pairs of cameras `[P, 2]` whose touching planes are well defined."""
+    pairs = np.stack(np.triu_indices(len(centres), k=1), axis=-1)
+    first, second = centres[pairs.T]
+    apart = np.linalg.norm(second - first, axis=-1) > NEAREST * np.linalg.norm(first, axis=-1)
+    angles = np.ptp(_touching_planes(centres, directions, pairs), axis=-1)
+    pairs = pairs[apart & (angles.max(axis=-1) < WIDEST)]
+    return pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS)).round().astype(int)]
