@@ -335,7 +335,9 @@ def similarity(
     return np.linalg.norm(errors(best.x), axis=-1)
 
 
-@pytest.mark.parametrize(("name", "views"), [("lotus_vase", 2), ("robot", 3), ("watering_can", 3)])
+@pytest.mark.parametrize(
+    ("name", "views"), [("lotus_vase", 2), ("robot", 3), ("tram", 5), ("suitcase", 6), ("juice_carton", 8)]
+)
 def test_any_object_is_projected_onto_all_photographs_it_was_cropped_from(
     name: str, views: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -344,7 +346,8 @@ def test_any_object_is_projected_onto_all_photographs_it_was_cropped_from(
     points, truths, photographs, poses = scene.to_geometry().vertices, [], {}, []
     for view in range(views):
         aside = 10 * math.cos(2.0 * view), 10 * math.sin(2.0 * view)
-        truth, image = photographed(scene, (5 + 12 * view, 40 + 70 * view), aside)
+        looks = 10 + 20 * math.sin(1.7 * view), 40 + 360 / views * view + 10 * math.sin(3.0 * view)
+        truth, image = photographed(scene, looks, aside)
         image.save(tmp_path / f"{view}.png")
         photographs[view] = Photograph(str(tmp_path / f"{view}.png"), image, None, False), crop_to_object(image, "a")
         truths.append(truth)
@@ -354,14 +357,14 @@ def test_any_object_is_projected_onto_all_photographs_it_was_cropped_from(
     frames = json.loads((tmp_path / "out" / "original" / "transforms.json").read_text())["frames"]
     written = [truths[0]._replace(matrix=np.array(frame["transform_matrix"])) for frame in frames]
     seen = [truth.pixels(points) for truth in truths]
-    assert min(np.ptp(pixels, axis=0).max() for pixels in seen) > 180
+    assert min(np.ptp(pixels, axis=0).max() for pixels in seen) > 170
     error = similarity(written, points, seen)
-    assert error.mean() < 2
+    assert (error.mean() if views == 2 else error.max()) < 2
     unmatched = [
         photograph_camera("", pose, (SIDE, SIDE), prepared.box, truths[0].focal, DEGREES)
         for (_, prepared), pose in zip(photographs.values(), poses, strict=True)
     ]
-    assert error.mean() < 0.5 * similarity(unmatched, points, seen).mean()
+    assert error.mean() < 0.25 * similarity(unmatched, points, seen).mean()
     hull = trimesh.load(tmp_path / "out" / "original" / "sparse_pc.ply").vertices
     for camera, pixels in zip(written, seen, strict=True):  # the visual hull is as large as the object everywhere
         np.testing.assert_allclose(camera.pixels(hull).min(axis=0), pixels.min(axis=0), atol=12)

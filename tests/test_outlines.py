@@ -1,4 +1,4 @@
-"""Cameras shifted until outlines match: against truth, and where outlines determine nothing."""
+"""Cameras whose outlines match: against truth, and where outlines determine nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from lp_framework.data.outlines import CORNERS, LARGEST, convex_outline, match_outlines
-from lp_framework.geometry import camera_to_world
+from lp_framework.geometry import camera_to_world, level_camera, view_pose
 
 POINTS = np.random.default_rng(0).normal(size=(200, 3)) * [0.15, 0.25, 0.1]
 
@@ -31,10 +31,12 @@ def outlines(cameras: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(rays)
 
 
-def shifted(cameras: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    result = cameras.copy()
-    result[:, :3, 3] += np.random.default_rng(1).normal(size=(len(cameras), 3)) * size
-    return result
+def shifted(cameras: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
+    """Level cameras at the same latitudes and longitudes, but with other distances, that see the origin elsewhere."""
+    poses, random = view_pose(torch.from_numpy(cameras)), np.random.default_rng(seed)
+    poses[:, 2] *= torch.from_numpy(np.exp(0.15 * random.normal(size=len(cameras))))
+    directions = np.concatenate([0.05 * random.normal(size=(len(cameras), 2)), -np.ones((len(cameras), 1))], axis=1)
+    return level_camera(poses, torch.from_numpy(directions)).numpy()
 
 
 def misplaced(cameras: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
@@ -43,15 +45,42 @@ def misplaced(cameras: NDArray[np.float64], truth: NDArray[np.float64]) -> float
     return float(np.sqrt(((ours * (ours * true).sum() / (ours**2).sum() - true) ** 2).sum(axis=-1).mean()))
 
 
-@pytest.mark.parametrize("places", [[(10, 0), (20, 50)], [(0, 0), (30, 70), (-10, 160), (20, 250), (60, 300)]])
-def test_positions_are_recovered_up_to_a_translation_and_a_scale(places: list[tuple[float, float]]):
+def misoriented(cameras: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """The root mean square angle between the cameras and the true ones, in degrees."""
+    relative = np.swapaxes(cameras[:, :3, :3], 1, 2) @ truth[:, :3, :3]
+    angles = np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    return float(np.degrees(np.sqrt((angles**2).mean())))
+
+
+AROUND = [(0, 0), (30, 70), (-10, 160), (20, 250), (60, 300)]
+MORE = [*AROUND, (10, 30), (-20, 100), (40, 200)]
+
+
+@pytest.mark.parametrize(("places", "left"), [([(0, 0), (20, 50), (10, 120)], 0.6), (AROUND, 0.4), (MORE, 0.05)])
+def test_cameras_are_recovered_up_to_a_translation_and_a_scale(places: list[tuple[float, float]], left: float):
     truth = cameras_of(*places)
-    start = shifted(truth, 0.05)
-    found = match_outlines(start, outlines(truth))
-    np.testing.assert_array_equal(found[:, :3, :3], truth[:, :3, :3])
-    assert misplaced(found, truth) < 0.1 * misplaced(start, truth)
-    again = match_outlines(found, outlines(truth))
-    np.testing.assert_allclose(again, found, atol=0.01)
+    for seed in range(4):
+        start = shifted(truth, seed)
+        found = match_outlines(start, outlines(truth))
+        assert misplaced(found, truth) < left * misplaced(start, truth)
+
+
+def test_the_more_outlines_the_better_their_cameras_orientations():
+    errors = []
+    for places in (AROUND, MORE):
+        truth = cameras_of(*places)
+        start = shifted(truth)
+        found = match_outlines(start, outlines(truth))
+        errors.append(misoriented(found, truth) / misoriented(start, truth))
+    assert errors[0] < 0.4 and errors[1] < 0.1
+
+
+def test_cameras_stay_level_at_their_latitudes_and_longitudes():
+    truth = cameras_of(*AROUND)
+    found = match_outlines(shifted(truth), outlines(truth))
+    expected, actual = (view_pose(torch.from_numpy(each))[:, :2] for each in (truth, found))
+    torch.testing.assert_close(actual, expected)
+    np.testing.assert_allclose(found[:, 1, 0], 0, atol=1e-12)  # the +X axis is horizontal
 
 
 def test_matching_outlines_move_no_camera():
@@ -69,8 +98,11 @@ def test_a_single_the_same_and_opposite_cameras_stay(places: list[tuple[float, f
 def test_outlines_that_cannot_match_move_cameras_by_a_bounded_amount():
     cameras = cameras_of((10, 0), (20, 60), (0, 150))
     wrong = outlines(cameras) * [[[3, 3, 1]], [[1, 1, 1]], [[0.2, 0.2, 1]]]
-    moved = np.linalg.norm((match_outlines(cameras, wrong) - cameras)[:, :3, 3], axis=-1)
-    assert np.isfinite(moved).all() and moved.max() < 2.0 * 3 * LARGEST
+    moved = match_outlines(cameras, wrong)
+    origins = -np.einsum("vji,vj->vi", moved[:, :3, :3], moved[:, :3, 3])
+    assert np.isfinite(moved).all()
+    assert (np.abs(origins[:, :2] / origins[:, 2:]) < LARGEST + 1e-9).all()
+    assert (np.abs(np.log(-origins[:, 2] / 2.0)) < LARGEST + 1e-9).all()
 
 
 def test_a_convex_outline_surrounds_whole_pixels():

@@ -222,7 +222,7 @@ def original_focal_length(
 
 
 def match_cameras(cameras: Sequence[Camera], images: Sequence[Image.Image], crops: Sequence[Crop]) -> list[Camera]:
-    """Shift cameras until the object's outlines in crops of their images match, see `match_outlines`."""
+    """Move cameras until the object's outlines in crops of their images match, see `match_outlines`."""
     rays = []
     for camera, image, crop in zip(cameras, images, crops, strict=True):
         pixels = (convex_outline(np.asarray(image)[..., 3] >= HALF) - SIZE / 2) * crop.scale + crop.middle
@@ -236,7 +236,7 @@ def export_cameras(
     folder: Path, photographs: Mapping[int, tuple[Photograph, Prepared]], poses: Tensor, field_of_view_degrees: float
 ) -> None:
     """Write the cameras of numbered photographs with view poses `[V, 3]`: for the prepared images in `folder/images`,
-    for copies of the photographs in `folder/original`, and as `cameras.glb`. The cameras of crops are shifted until the
+    for copies of the photographs in `folder/original`, and as `cameras.glb`. The cameras of crops are moved until the
     object's outlines match."""
     files = {number: Path(photograph.name) for number, (photograph, _) in photographs.items()}
     images = [prepared.image for _, prepared in photographs.values()]

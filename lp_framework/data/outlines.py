@@ -1,24 +1,29 @@
-"""Positions of cameras with known rotations, from the outlines of an object in their images.
+"""Cameras with known latitudes and longitudes, from the outlines of an object in their images.
 
 The middle of an outline serves as the object's centre, but it is a different point of the object in every image.
 However, the planes through two cameras that touch the object touch its outlines in both images (epipolar tangency:
-Wong & Cipolla, Structure and Motion from Silhouettes, 2001), and this determines the cameras' relative positions.
+Wong & Cipolla, Structure and Motion from Silhouettes, 2001). This determines where in each image the centre is, and how
+far away, the better the more images there are.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull
 from trimesh.util import unitize
 
+from lp_framework.geometry import level_camera, view_pose
+
 CORNERS = 64  # of an outline's convex hull
 WIDEST = 2.5  # radians between the two touching planes of a pair; at pi they coincide, and nothing can be compared
 NEAREST = 0.05  # distance between two cameras, relative to their distance from the object
 MOST_PAIRS = 500  # of cameras that are compared; with many cameras, more pairs only cost time
-LARGEST = 0.2  # shift; larger ones mean that the rotations are wrong
-REGULARIZATION = 0.1  # weight of the shifts, which determines what the outlines leave open
+LARGEST = 0.5  # shift; larger ones mean that the poses are wrong
+SPREAD = (0.0125, 0.0125, 0.065)  # standard deviations of the shifts where the poses are exact
+ERRORS = 0.004, 0.0005  # radians, of the angles of touching planes: the first assumption and the least
 
 
 def convex_outline(opaque: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -30,29 +35,36 @@ def convex_outline(opaque: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def match_outlines(cameras: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shift cameras to world `[V, 4, 4]` (OpenGL axes), which look at an object around the origin, until its outlines
-    match; rotations stay. `rays` `[V, K, 3]` point from each camera, in its axes, to K corners of the outline.
+    """Shift the point at which level cameras to world `[V, 4, 4]` (OpenGL axes) see the origin, and its distance, until
+    the outlines of the object there match. `rays` `[V, K, 3]` point from each camera, in its axes, to K corners of the
+    outline.
 
-    A shift moves a camera in its image plane and changes its distance, each by up to `LARGEST` of the distance. What
-    the outlines leave open, above all the position of the object as a whole, stays as close as possible.
+    A camera stays at its latitude and longitude, and level. What the outlines leave open stays as close as possible;
+    the less the outlines match in the end, because the poses are wrong, the more of it.
     """
-    rotations, directions = cameras[:, :3, :3], np.einsum("vij,vkj->vki", cameras[:, :3, :3], rays)
-    origins = -np.einsum("vji,vj->vi", rotations, cameras[:, :3, 3])  # in the cameras' axes
-    pairs = _comparable_pairs(cameras[:, :3, 3], directions)
+    places = view_pose(torch.from_numpy(cameras))
+    origins = -np.einsum("vji,vj->vi", cameras[:, :3, :3], cameras[:, :3, 3])  # in the cameras' axes
+    pairs = _comparable_pairs(cameras[:, :3, 3], np.einsum("vij,vkj->vki", cameras[:, :3, :3], rays))
 
-    def positions(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def shifted(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
         sideways, distance = np.split(shifts.reshape(-1, 3), [2], axis=1)
-        moved = (origins - origins[:, 2:] * np.pad(sideways, ((0, 0), (0, 1)))) * np.exp(distance)
-        return -np.einsum("vij,vj->vi", rotations, moved)
+        seen = (origins - origins[:, 2:] * np.pad(sideways, ((0, 0), (0, 1)))) * np.exp(distance)
+        radii = np.linalg.norm(seen, axis=-1, keepdims=True)
+        return level_camera(torch.cat([places[:, :2], torch.from_numpy(radii)], dim=-1), torch.from_numpy(seen)).numpy()
 
-    def residuals(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
-        sides = _touching_planes(positions(shifts), directions, pairs)
-        return np.concatenate([(sides[:, 0] - sides[:, 1]).ravel(), REGULARIZATION * shifts])
+    def differences(shifts: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved = shifted(shifts)
+        sides = _touching_planes(moved[:, :3, 3], np.einsum("vij,vkj->vki", moved[:, :3, :3], rays), pairs)
+        return (sides[:, 0] - sides[:, 1]).ravel()
 
-    found = least_squares(residuals, np.zeros(3 * len(cameras)), bounds=(-LARGEST, LARGEST), x_scale=0.05)
-    result = cameras.copy()
-    result[:, :3, 3] = positions(found.x)
-    return result
+    def residuals(shifts: NDArray[np.float64], error: float) -> NDArray[np.float64]:
+        return np.concatenate([differences(shifts) / error, (shifts.reshape(-1, 3) / SPREAD).ravel()])
+
+    shifts, error = np.zeros(3 * len(cameras)), ERRORS[0]
+    for _ in range(2 if len(pairs) else 0):  # the second time with the error that the first leaves
+        shifts = least_squares(residuals, shifts, bounds=(-LARGEST, LARGEST), x_scale=0.05, args=(error,)).x
+        error = max(ERRORS[1], float(np.sqrt(np.mean(differences(shifts) ** 2))))
+    return shifted(shifts)
 
 
 def _touching_planes(
