@@ -39,8 +39,8 @@ def match_outlines(cameras: NDArray[np.float64], rays: NDArray[np.float64]) -> N
     the outlines of the object there match. `rays` `[V, K, 3]` point from each camera, in its axes, to K corners of the
     outline.
 
-    A camera stays at its latitude and longitude, and level. What the outlines leave open stays as close as possible;
-    the less the outlines match in the end, because the poses are wrong, the more of it.
+    A camera stays level at its latitude and longitude. Shifts are regularized by their typical size, in relation to the
+    error with which the outlines match in the end, so that wrong poses do not cause large shifts.
     """
     places = view_pose(torch.from_numpy(cameras))
     origins = -np.einsum("vji,vj->vi", cameras[:, :3, :3], cameras[:, :3, 3])  # in the cameras' axes
