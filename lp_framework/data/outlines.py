@@ -22,7 +22,7 @@ WIDEST = 2.5  # radians between the two touching planes of a pair; at pi they co
 NEAREST = 0.05  # distance between two cameras, relative to their distance from the object
 MOST_PAIRS = 500  # of cameras that are compared; with many cameras, more pairs only cost time
 LARGEST = 0.5  # shift; larger ones mean that the poses are wrong
-SPREAD = (0.0125, 0.0125, 0.065)  # standard deviations of the shifts where the poses are exact
+SPREAD = (0.0125, 0.0125, 0.065)  # standard deviations of shifts for exact poses (the twelve embedded objects)
 ERRORS = 0.004, 0.0005  # radians, of the angles of touching planes: the first assumption and the least
 
 
