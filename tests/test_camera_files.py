@@ -335,7 +335,7 @@ def similarity(
     return np.linalg.norm(errors(best.x), axis=-1)
 
 
-@pytest.mark.parametrize(("name", "views"), [("lotus_vase", 2), ("robot", 3), ("suitcase", 6)])
+@pytest.mark.parametrize(("name", "views"), [("lotus_vase", 2), ("watering_can", 2), ("robot", 3), ("suitcase", 6)])
 def test_any_object_is_projected_onto_all_photographs_it_was_cropped_from(
     name: str, views: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

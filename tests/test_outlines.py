@@ -63,6 +63,8 @@ def test_cameras_are_recovered_up_to_a_translation_and_a_scale(places: list[tupl
         start = shifted(truth, seed)
         found = match_outlines(start, outlines(truth))
         assert misplaced(found, truth) < left * misplaced(start, truth)
+        again = match_outlines(found, outlines(truth))
+        np.testing.assert_allclose(again, found, atol=0.05)
 
 
 def test_the_more_outlines_the_better_their_cameras_orientations():
